@@ -41,7 +41,11 @@ def read_calibration(path: Path) -> Calibration:
         raise ConfigError(f"{path}: {error}") from None
 
 
-def write_calibration(path: Path, calibration: Calibration, header: str = "") -> None:
+def write_calibration(
+    path: Path,
+    calibration: Calibration,
+    header: str = "",
+) -> None:
     """Write a calibration file, completely or not at all.
 
     Args:

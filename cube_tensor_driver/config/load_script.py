@@ -265,7 +265,14 @@ def _make_action(kind: str, item: dict[str, Any]) -> Action:
         # action and falls to 0 in the last third.
         force = np.array([0.0, force, force, 0.0])
     shear = np.atleast_2d(np.array(item.get("shear", [0.0, 0.0, 0.0]), float))
-    return Action(kind, float(item["from"]), float(item["to"]), path, force, shear)
+    return Action(
+        kind,
+        float(item["from"]),
+        float(item["to"]),
+        path,
+        force,
+        shear,
+    )
 
 
 def _find_contradictions(script: Script) -> Iterator[str]:
@@ -291,7 +298,11 @@ def _find_contradictions(script: Script) -> Iterator[str]:
                 )
 
 
-def _find_action_mistakes(action: Action, friction: float, period: float | None) -> Iterator[str]:
+def _find_action_mistakes(
+    action: Action,
+    friction: float,
+    period: float | None,
+) -> Iterator[str]:
     if action.end <= action.start:
         yield "ends before it begins; to must be later than from"
     if not action.force.any():

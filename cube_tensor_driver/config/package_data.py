@@ -35,7 +35,12 @@ def package_data() -> Path:
     )
 
 
-def find_shipped(pattern: str, name: str, folder: Path, advice: str) -> Path:
+def find_shipped(
+    pattern: str,
+    name: str,
+    folder: Path,
+    advice: str,
+) -> Path:
     """Return the path of a file that the package contains, or that the user names.
 
     Args:

@@ -287,7 +287,12 @@ def check_skin_data(data: object, folder: Path) -> tuple[Skin | None, list[str]]
     malformed = {where[:2] for where, _ in schema_mistakes}
 
     links = tuple(
-        SkinLink(item["name"], item["port"], item.get("baud", BAUD), _parse_uid(item, "hub_uid"))
+        SkinLink(
+            item["name"],
+            item["port"],
+            item.get("baud", BAUD),
+            _parse_uid(item, "hub_uid"),
+        )
         for number, item in enumerate(data["links"])
         if ("links", number) not in malformed
     )
@@ -325,7 +330,14 @@ def check_skin_data(data: object, folder: Path) -> tuple[Skin | None, list[str]]
         return None, mistakes
     # YAML reads a rate without a decimal point as an integer.
     rate = None if data.get("rate") is None else float(data["rate"])
-    skin = Skin(data["name"], data["parent_frame"], rate, links, cubes, elastomer=elastomer)
+    skin = Skin(
+        data["name"],
+        data["parent_frame"],
+        rate,
+        links,
+        cubes,
+        elastomer=elastomer,
+    )
     return skin, []
 
 
@@ -376,7 +388,9 @@ def _read_cubes(
 
 
 def _find_contradictions(
-    cube: SkinCube, item: dict[str, Any], links: list[str] | None
+    cube: SkinCube,
+    item: dict[str, Any],
+    links: list[str] | None,
 ) -> Iterator[str]:
     """Yield a mistake for each key of a cube that contradicts another key or the calibration.
 
@@ -437,7 +451,10 @@ def _find_cube_mistakes(cubes: tuple[SkinCube, ...]) -> Iterator[str]:
     yield from _find_repeated("cubes", "link and index", addresses)
 
 
-def _find_pad_mistakes(links: tuple[SkinLink, ...], cubes: tuple[SkinCube, ...]) -> Iterator[str]:
+def _find_pad_mistakes(
+    links: tuple[SkinLink, ...],
+    cubes: tuple[SkinCube, ...],
+) -> Iterator[str]:
     """Yield a mistake for each link whose cubes differ in their number of pads.
 
     The cubes of a link must have equal numbers of pads, because a SAMPLE frame of the hubs'

@@ -27,7 +27,13 @@ def make_skin_urdf(skin: Skin) -> str:
     material = f"{skin.name}_cube"
     SubElement(SubElement(robot, "material", name=material), "color", rgba=CUBE_COLOUR)
     for cube in skin.cubes:
-        _add_cube(robot, cube, skin.frame(cube), skin.parent_frame, material)
+        _add_cube(
+            robot,
+            cube,
+            skin.frame(cube),
+            skin.parent_frame,
+            material,
+        )
 
     # The text is indented because users paste it into the URDF of their robot.
     ElementTree.indent(robot)

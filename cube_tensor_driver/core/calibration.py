@@ -172,7 +172,12 @@ class Calibration:
             self._set("matrix", read_numbers(self.matrix, "matrix", CalibrationError, shape))
         if self.covariance is not None:
             square = (structure.n_coefficients, structure.n_coefficients)
-            covariance = read_numbers(self.covariance, "covariance", CalibrationError, square)
+            covariance = read_numbers(
+                self.covariance,
+                "covariance",
+                CalibrationError,
+                square,
+            )
             self._set("covariance", covariance)
 
     def _check_effects(self) -> None:
@@ -243,7 +248,11 @@ class Calibration:
         )
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
-    def check(self, layout: Layout | None = None, uid: int | None = None) -> None:
+    def check(
+        self,
+        layout: Layout | None = None,
+        uid: int | None = None,
+    ) -> None:
         """Check that the calibration belongs to a cube.
 
         Args:

@@ -72,9 +72,19 @@ class Layout:
                 f"1 to {MAX_PADS} pads"
             )
         normals = read_numbers(
-            self.normals, "layout: normals (x, y, z)", LayoutError, positions.shape
+            self.normals,
+            "layout: normals (x, y, z)",
+            LayoutError,
+            positions.shape,
         )
-        pad_size = float(read_numbers(self.pad_size, "layout: pad_size", LayoutError, ()))
+        pad_size = float(
+            read_numbers(
+                self.pad_size,
+                "layout: pad_size",
+                LayoutError,
+                (),
+            )
+        )
         if not 0 < pad_size <= 2:
             self._refuse(f"pad_size {pad_size}; allowed is above 0, up to 2")
 

@@ -285,7 +285,11 @@ Equilibrium requires that the mode zz_z (sigma_zz = z / d0) also has sigma_zx = 
 the mode xx_x (sigma_xx = x / d0) also has sigma_zx = -z / d0.
 """
 
-PAPER = _make_modes(("zz", "zx", "xx", "xz", *_PLANE_GRADIENTS), "zx", symmetric=False)
+PAPER = _make_modes(
+    ("zz", "zx", "xx", "xz", *_PLANE_GRADIENTS),
+    "zx",
+    symmetric=False,
+)
 """The eight modes of Kiyota & Shinoda, eq. 1, with separate amplitudes for sigma_zx and sigma_xz.
 
 Moment equilibrium makes the two equal, so these modes serve only for comparison.

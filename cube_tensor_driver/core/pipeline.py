@@ -170,7 +170,10 @@ class Pipeline:
         self._n_extra = 0
         self.newest_offset: Real | None = None
         self.rest_frequency = tabulate_pads(
-            self.calibrations, "rest_frequency", self.n_pads, fill=np.nan
+            self.calibrations,
+            "rest_frequency",
+            self.n_pads,
+            fill=np.nan,
         )
 
     def __repr__(self) -> str:
@@ -476,7 +479,12 @@ class Pipeline:
         group = self._tables.calibration[cube]
         masks = columns.pad_fault if left_out is None else np.asarray(left_out)
         with np.errstate(all="ignore"):
-            v, is_good = apply_law(self._tables, cube, columns.frequency, columns.temperature)
+            v, is_good = apply_law(
+                self._tables,
+                cube,
+                columns.frequency,
+                columns.temperature,
+            )
         is_left_out = mask_bits(self._tables, group, masks)
         is_used = is_good & ~is_left_out & is_known[:, None]
         stress = np.where(is_used, v * self._stiffness[group], 0)
@@ -544,7 +552,12 @@ class Pipeline:
         keys[place] = key
         numbers[place] = number
 
-    def _store_table(self, number: int, group: int, estimator: Estimator) -> None:
+    def _store_table(
+        self,
+        number: int,
+        group: int,
+        estimator: Estimator,
+    ) -> None:
         """Write the matrix and limits of rows with the same calibration and the same good pads.
 
         Args:

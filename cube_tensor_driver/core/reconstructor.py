@@ -47,7 +47,11 @@ class RecordedHealth(NamedTuple):
         Args:
             chosen: Row numbers, a slice or a mask (N,), with which numpy indexes an array.
         """
-        return RecordedHealth(self.known[chosen], self.left_out[chosen], self.status[chosen])
+        return RecordedHealth(
+            self.known[chosen],
+            self.left_out[chosen],
+            self.status[chosen],
+        )
 
 
 class CalibratedSkin(Protocol):
@@ -75,7 +79,9 @@ class Reconstructor:
     """
 
     def __init__(
-        self, skin: CalibratedSkin | Sequence[Calibration], dtype: type = np.float32
+        self,
+        skin: CalibratedSkin | Sequence[Calibration],
+        dtype: type = np.float32,
     ) -> None:
         """Prepare the reconstruction of a skin.
 
@@ -213,7 +219,11 @@ class Reconstructor:
             covariance = covariance + np.outer(components, components)
         return covariance
 
-    def tare(self, cubes: Sequence[int] | None = None, duration: float = 1.0) -> Array:
+    def tare(
+        self,
+        cubes: Sequence[int] | None = None,
+        duration: float = 1.0,
+    ) -> Array:
         """Take the present load of cubes as their unloaded state.
 
         The mean frequencies of the newest data become the frequencies without load.

@@ -200,7 +200,11 @@ class StressRows(_Rows):
             sequence=sequence,
             left_out=left_out,
         )
-        return cls(stress=np.asarray(stress), gradient=np.asarray(gradient), **columns)
+        return cls(
+            stress=np.asarray(stress),
+            gradient=np.asarray(gradient),
+            **columns,
+        )
 
 
 def concatenate(parts: Sequence[_Kind]) -> _Kind:

@@ -266,7 +266,13 @@ def find_structure(
     basis = np.array([member for _, member in members])
     basis = basis.reshape(-1, *is_assigned.shape)
     basis.flags.writeable = False
-    return Structure(layout, modes, symmetry, names, basis)
+    return Structure(
+        layout,
+        modes,
+        symmetry,
+        names,
+        basis,
+    )
 
 
 def _read_signed_permutations(matrices: Array) -> tuple[Index, Index]:

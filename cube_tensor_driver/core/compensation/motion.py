@@ -98,7 +98,12 @@ class ForcesAtCubes:
         columns["specific_force"] = force
         return FrequencyRows(**columns)
 
-    def _find_forces(self, rows: FrequencyRows, time_ns: Times, known: Array) -> Single:
+    def _find_forces(
+        self,
+        rows: FrequencyRows,
+        time_ns: Times,
+        known: Array,
+    ) -> Single:
         """Return the specific forces (N, 3) of rows in the frames of their cubes; NaN: unknown.
 
         Args:

@@ -126,7 +126,14 @@ def measure_rest(
         means = _average(windows)
         factor = pipeline.unloaded_factor(chosen, health.temperature[chosen])
         rest = means.frequency / factor
-        _check_pads(health, chosen, used, rest, means, names)
+        _check_pads(
+            health,
+            chosen,
+            used,
+            rest,
+            means,
+            names,
+        )
     result[chosen] = np.where(used, rest, result[chosen])
     return result
 
@@ -251,7 +258,12 @@ def _check_pads(
     """
     pipeline = health.pipeline
     calibrations = [pipeline.calibrations[cube] for cube in chosen.tolist()]
-    calibrated = tabulate_pads(calibrations, "rest_frequency", pipeline.n_pads, np.nan)
+    calibrated = tabulate_pads(
+        calibrations,
+        "rest_frequency",
+        pipeline.n_pads,
+        np.nan,
+    )
     noise = health.diagnosis.noise[chosen]
     jumped = means.span > JUMP_SPAN_RATIO * means.noise
     noise_ratio = np.where(jumped, 0, means.noise / noise)
