@@ -455,7 +455,12 @@ class MessageCodec(Generic[AnyRows]):
                 rows and pads.
         """
         seconds, nanoseconds, *counts = layout.numbers.unpack_from(message)
-        for name, found, needed in zip(layout.sequences, counts, layout.counts, strict=True):
+        for name, found, needed in zip(
+            layout.sequences,
+            counts,
+            layout.counts,
+            strict=True,
+        ):
             if found != needed:
                 raise MessageError(
                     f"{self._name} of {layout.shape.rows} rows has {found} values of {name}, "

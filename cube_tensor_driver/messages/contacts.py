@@ -105,7 +105,13 @@ def make_traction_message(
         cloud: Points (M, 6) with the columns of `CLOUD`: position in m, pressure, shear stress and
             standard deviation of the pressure in Pa.
     """
-    return make_cloud_message(make, stamp_ns, frame_id, CLOUD, cloud)
+    return make_cloud_message(
+        make,
+        stamp_ns,
+        frame_id,
+        CLOUD,
+        cloud,
+    )
 
 
 def decode_contacts(message: Any) -> list[Contact]:
@@ -125,7 +131,12 @@ def decode_contacts(message: Any) -> list[Contact]:
     slips = [state == SLIP for state in message.slip] or unknown
     is_coarse = [not refined for refined in message.refined] or unknown
     return [
-        Contact(read_xyz(position), read_xyz(normal), read_xyz(force), *others)
+        Contact(
+            read_xyz(position),
+            read_xyz(normal),
+            read_xyz(force),
+            *others,
+        )
         for position, normal, force, *others in zip(*columns, slips, is_coarse, strict=True)
     ]
 

@@ -148,7 +148,11 @@ def write_rviz_file(skin: Skin) -> str:
     return str(path)
 
 
-def record_skin(context: LaunchContext, namespace: str, skin_name: str) -> ExecuteProcess:
+def record_skin(
+    context: LaunchContext,
+    namespace: str,
+    skin_name: str,
+) -> ExecuteProcess:
     """Return the action that starts `ros2 bag record` for the topics of the skin.
 
     An including launch file may set a namespace, remaps and the parameter `qos_reliability` for all
@@ -176,7 +180,11 @@ def record_skin(context: LaunchContext, namespace: str, skin_name: str) -> Execu
     command += ["--qos-profile-overrides-path", str(overrides)]
     # `ros2 bag record` of Humble lacks the option --topics; all releases have --regex.
     command += ["--regex", f"^({'|'.join(qualities)})$"]
-    return ExecuteProcess(cmd=command, name="recorder", output="screen")
+    return ExecuteProcess(
+        cmd=command,
+        name="recorder",
+        output="screen",
+    )
 
 
 def _list_recorded_topics(
@@ -261,7 +269,14 @@ def check_arguments(context: LaunchContext, declared: Iterable[str]) -> SkinArgu
     for name, packages in NEEDED_PACKAGES.items():
         if name in switched_on:
             _check_installed(name, packages)
-    return SkinArguments(texts, switched_on, path, skin, load, parameters)
+    return SkinArguments(
+        texts,
+        switched_on,
+        path,
+        skin,
+        load,
+        parameters,
+    )
 
 
 def _check_names(context: LaunchContext, declared: Iterable[str]) -> None:

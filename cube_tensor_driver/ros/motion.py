@@ -128,7 +128,12 @@ class GravityMotion:
     is taken from TF.
     """
 
-    def __init__(self, node: CubeNode, frame: str, parent_frame: str) -> None:
+    def __init__(
+        self,
+        node: CubeNode,
+        frame: str,
+        parent_frame: str,
+    ) -> None:
         """Listen to TF.
 
         Args:
@@ -192,7 +197,12 @@ class _Sample(NamedTuple):
 class ImuMotion:
     """The motion of a skin from an IMU that is fixed to the same rigid body."""
 
-    def __init__(self, node: CubeNode, topic: str, parent_frame: str) -> None:
+    def __init__(
+        self,
+        node: CubeNode,
+        topic: str,
+        parent_frame: str,
+    ) -> None:
         """Subscribe to an IMU.
 
         Args:
@@ -209,7 +219,15 @@ class ImuMotion:
         self._imu_frame = parent_frame
         self._problem = f"no message on {topic}: start the IMU, or set imu to its topic"
         self._node = node
-        node.own(node.create_subscription(Imu, topic, self.on_imu, NEWEST, raw=True))
+        node.own(
+            node.create_subscription(
+                Imu,
+                topic,
+                self.on_imu,
+                NEWEST,
+                raw=True,
+            )
+        )
 
     def on_imu(self, data: bytes) -> None:
         """Store a serialised message of the IMU, which `motion` uses.

@@ -219,7 +219,13 @@ class CubeNode(LifecycleNode):
         **options: Any,
     ) -> Any:
         callback = self.callback_errors.catch(callback)
-        return super().create_subscription(msg_type, topic, callback, *others, **options)
+        return super().create_subscription(
+            msg_type,
+            topic,
+            callback,
+            *others,
+            **options,
+        )
 
     def create_timer(
         self,
@@ -241,7 +247,13 @@ class CubeNode(LifecycleNode):
     ) -> Any:
         callback = self.callback_errors.catch_in_service(callback)
         options.setdefault("qos_profile", SERVICES)
-        return super().create_service(srv_type, srv_name, callback, *others, **options)
+        return super().create_service(
+            srv_type,
+            srv_name,
+            callback,
+            *others,
+            **options,
+        )
 
     def _protect_lifecycle_services(self) -> None:
         """Catch exceptions in the lifecycle services, which rclpy makes without `create_service`.

@@ -62,7 +62,9 @@ parameter services of rclpy have a depth of 1000, too.
 
 
 def batch_profile(
-    rate_hz: float | None, reliability: str = "reliable", rows: int = 1
+    rate_hz: float | None,
+    reliability: str = "reliable",
+    rows: int = 1,
 ) -> QoSProfile:
     """Return the profile of a batch topic: `frequencies`, `stress` or `forces`.
 

@@ -78,8 +78,20 @@ class SkinSubscriber:
         catch = CallbackErrors(node).catch
         on_info = catch(self._receive_info)
         on_stress = catch(self._receive_stress)
-        self._info = CheckedSubscription(node, SkinInfo, "info", on_info, LATCHED)
-        self._stress = node.create_subscription(SkinStress, "stress", on_stress, NEWEST, raw=True)
+        self._info = CheckedSubscription(
+            node,
+            SkinInfo,
+            "info",
+            on_info,
+            LATCHED,
+        )
+        self._stress = node.create_subscription(
+            SkinStress,
+            "stress",
+            on_stress,
+            NEWEST,
+            raw=True,
+        )
 
     def close(self) -> None:
         """End the subscriptions to `info` and `stress`."""

@@ -169,7 +169,10 @@ class _Listener:
             # subscribes, so the subscription comes before the search for the publisher.
             profile = match_offered_profile([], QUEUE_DEPTH)
             self._early_subscription = node.create_subscription(
-                StressTensorStamped, topic, self._on_message, profile
+                StressTensorStamped,
+                topic,
+                self._on_message,
+                profile,
             )
 
     @property
@@ -209,7 +212,13 @@ class _Listener:
             namespace = self._topic.rpartition("/")[0]
             info = f"{namespace}/info"
             self._node.create_subscription(SkinInfo, info, self._on_info, LATCHED)
-            self._node.create_subscription(kind, self._topic, self._on_stress, profile, raw=True)
+            self._node.create_subscription(
+                kind,
+                self._topic,
+                self._on_stress,
+                profile,
+                raw=True,
+            )
         else:
             self._node.create_subscription(kind, self._topic, self._on_message, profile)
 

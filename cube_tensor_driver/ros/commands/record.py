@@ -216,7 +216,13 @@ class Recorder:
             self._waiting.append((topic, clock.now().nanoseconds, data))
 
         kind = find_message_class(topic, type_name)
-        subscription = self._node.create_subscription(kind, topic, receive, profile, raw=True)
+        subscription = self._node.create_subscription(
+            kind,
+            topic,
+            receive,
+            profile,
+            raw=True,
+        )
         self._subscriptions.append(subscription)
         self._unconnected[topic] = subscription
 

@@ -189,7 +189,12 @@ class Player:
             self.stop.set()
             self._wake.notify()
 
-    def run(self, start: float, loop: bool, hold: bool = False) -> None:
+    def run(
+        self,
+        start: float,
+        loop: bool,
+        hold: bool = False,
+    ) -> None:
         """Publish the bag to its end.
 
         Args:
@@ -386,7 +391,11 @@ class ReplayControl:
     def _publish_state(self) -> None:
         player = self._player
         self._state.publish(
-            ReplayState(position=player.position, length=player.length, paused=player.paused)
+            ReplayState(
+                position=player.position,
+                length=player.length,
+                paused=player.paused,
+            )
         )
 
     def _steer(
@@ -435,7 +444,13 @@ def replay(
     """
     errors: list[BagError] = []
     with node_session("player") as (node, executor):
-        player = Player(node, bag, rate=rate, stress=stress, clock=clock)
+        player = Player(
+            node,
+            bag,
+            rate=rate,
+            stress=stress,
+            clock=clock,
+        )
         ReplayControl(node, player)
         on_stop_signal(player.end)
 

@@ -96,7 +96,12 @@ def request_tare(cubes: Sequence[str], clear: bool) -> list[TareAnswer]:
             # The name of the service begins with that of its node, as in /reconstruction/tare.
             name = service.rpartition("/")[0]
             if clear:
-                answer = call_service(session, Trigger, f"{name}/clear_tare", Trigger.Request())
+                answer = call_service(
+                    session,
+                    Trigger,
+                    f"{name}/clear_tare",
+                    Trigger.Request(),
+                )
             else:
                 request = Tare.Request(cubes=list(cubes))
                 answer = call_service(session, Tare, service, request)
@@ -232,8 +237,18 @@ class _NodeParameters:
         if not result.successful:
             raise ConfigError(f"{refusal}: {result.reason}")
 
-    def _call(self, service_type: type, service: str, request: object) -> Any:
-        return call_service(self._session, service_type, f"{self._name}/{service}", request)
+    def _call(
+        self,
+        service_type: type,
+        service: str,
+        request: object,
+    ) -> Any:
+        return call_service(
+            self._session,
+            service_type,
+            f"{self._name}/{service}",
+            request,
+        )
 
 
 def _find_nodes(session: NodeSession, wanted_service: str = "") -> list[str]:
@@ -279,7 +294,12 @@ def find_services(session: NodeSession, kind: str, wanted: str = "") -> list[str
     return find()
 
 
-def call_service(session: NodeSession, service_type: type, name: str, request: object) -> Any:
+def call_service(
+    session: NodeSession,
+    service_type: type,
+    name: str,
+    request: object,
+) -> Any:
     """Call a service and return its response.
 
     The request is sent again every `REPEAT_S`, so it must be one that may be executed twice.

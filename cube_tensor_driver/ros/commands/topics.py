@@ -124,7 +124,11 @@ def _measure_rates(session: NodeSession, topics: list[ListedTopic]) -> None:
         node.destroy_subscription(subscription)
 
 
-def _subscribe(node: Node, topic: ListedTopic, counts: dict[str, int]) -> Subscription:
+def _subscribe(
+    node: Node,
+    topic: ListedTopic,
+    counts: dict[str, int],
+) -> Subscription:
     """Return a subscription that counts messages.
 
     Args:
@@ -143,4 +147,10 @@ def _subscribe(node: Node, topic: ListedTopic, counts: dict[str, int]) -> Subscr
 
     offers = node.get_publishers_info_by_topic(topic.counted_topic)
     profile = match_offered_profile(offers, QUEUE_DEPTH)
-    return node.create_subscription(kind, topic.counted_topic, receive, profile, raw=True)
+    return node.create_subscription(
+        kind,
+        topic.counted_topic,
+        receive,
+        profile,
+        raw=True,
+    )

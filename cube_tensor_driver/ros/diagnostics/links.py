@@ -80,7 +80,13 @@ def _make_rows_status(
         "rows per second": counts.delivered - before.delivered,
         **counts.not_delivered(),
     }
-    return make_status("rows", skin_name, level, text, values)
+    return make_status(
+        "rows",
+        skin_name,
+        level,
+        text,
+        values,
+    )
 
 
 def _make_link_status(report: LinkReport) -> DiagnosticStatus:

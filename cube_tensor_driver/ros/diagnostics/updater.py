@@ -103,5 +103,9 @@ def make_status(
     """
     pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
     return DiagnosticStatus(
-        name=name, hardware_id=hardware_id, level=level, message=text, values=pairs
+        name=name,
+        hardware_id=hardware_id,
+        level=level,
+        message=text,
+        values=pairs,
     )

@@ -82,7 +82,13 @@ warning for a colour with opacity 0."""
 class Canvas:
     """Draws the picture of a skin as a MarkerArray message."""
 
-    def __init__(self, frame_id: str, poses: CubePoses, *, crosses: bool) -> None:
+    def __init__(
+        self,
+        frame_id: str,
+        poses: CubePoses,
+        *,
+        crosses: bool,
+    ) -> None:
         """Prepare what is the same in all pictures.
 
         Args:
@@ -143,7 +149,15 @@ class Canvas:
         shapes = []
         for scale, make_arrows, value in zip(SCALES, functions, longest, strict=True):
             arrows = make_arrows(self._poses, values, scale.length * self._pitch / value)
-            shapes.append(draw_arrows(scale, scale.name, arrows, normal, self._pitch))
+            shapes.append(
+                draw_arrows(
+                    scale,
+                    scale.name,
+                    arrows,
+                    normal,
+                    self._pitch,
+                )
+            )
         return shapes
 
     def _draw_faults(self, health: Index) -> Shape:
@@ -225,7 +239,12 @@ def _make_plates(poses: CubePoses) -> list[tuple[Index, Shape]]:
     plates = []
     centres = scene.above(poses, PLATE_HEIGHT)
     groups, rotations = _group_by_orientation(poses.rotation)
-    oriented = zip(groups, rotations, quaternions(rotations), strict=True)
+    oriented = zip(
+        groups,
+        rotations,
+        quaternions(rotations),
+        strict=True,
+    )
     for number, (members, rotation, (w, x, y, z)) in enumerate(oriented):
         # All boxes of a marker have the same size, so that of the largest cube is taken.
         half_side = float(poses.half_side[members].max())

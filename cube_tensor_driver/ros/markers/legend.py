@@ -158,7 +158,13 @@ class LegendPlace(NamedTuple):
         return np.array([x, bar_bottom_y - below, self.z])
 
 
-def draw_arrows(scale: ArrowScale, name: str, arrows: Array, normal: Array, pitch: float) -> Shape:
+def draw_arrows(
+    scale: ArrowScale,
+    name: str,
+    arrows: Array,
+    normal: Array,
+    pitch: float,
+) -> Shape:
     """Return arrows as a shape of lines.
 
     Args:
@@ -168,7 +174,12 @@ def draw_arrows(scale: ArrowScale, name: str, arrows: Array, normal: Array, pitc
         normal: Direction perpendicular to the plane of each arrow, (n, 3).
         pitch: Distance of neighbouring cubes, in m.
     """
-    return make_lines(name, scene.heads(arrows, normal), LINE_WIDTH * pitch, scale.colour)
+    return make_lines(
+        name,
+        scene.heads(arrows, normal),
+        LINE_WIDTH * pitch,
+        scale.colour,
+    )
 
 
 def draw_legend(
@@ -219,7 +230,15 @@ def draw_legend(
         tail = place.point(0, line)
         tip = tail + np.array([scale.length * place.pitch, 0, 0])
         arrow = np.stack([tail, tip])[np.newaxis]
-        shapes.append(draw_arrows(scale, f"{scale.name} arrow", arrow, upwards, place.pitch))
+        shapes.append(
+            draw_arrows(
+                scale,
+                f"{scale.name} arrow",
+                arrow,
+                upwards,
+                place.pitch,
+            )
+        )
         text = f"{scale.name} {format_in_four_characters(value / scale.unit_si)} {scale.unit}"
         # The text begins to the right of the longest arrow. The position of a text marker is the
         # centre of the text. To compute it, letters are assumed to be half as wide as high.
@@ -228,7 +247,15 @@ def draw_legend(
         shapes.append(make_text(f"{scale.name} scale", text, height, centre))
 
     title = _make_title(quantity, top, health)
-    return [*shapes, make_text("legend", title, height, place.point(0.5, TITLE_LINE))]
+    return [
+        *shapes,
+        make_text(
+            "legend",
+            title,
+            height,
+            place.point(0.5, TITLE_LINE),
+        ),
+    ]
 
 
 def format_in_four_characters(value: float) -> str:
@@ -243,7 +270,11 @@ def format_in_four_characters(value: float) -> str:
     return next(text for text in texts if len(text) <= 4).ljust(4, ".")
 
 
-def _make_title(quantity: scene.Quantity, top: float, health: Index) -> str:
+def _make_title(
+    quantity: scene.Quantity,
+    top: float,
+    health: Index,
+) -> str:
     """Return the title: quantity and range of the colours, and number of cubes in each health.
 
     It is a single line, because RViz draws a second line 1 cm lower, whatever the size of the text.

@@ -67,7 +67,12 @@ class Shape(NamedTuple):
     text: str = ""
 
 
-def make_lines(name: str, ends: AnyArray, width: float, colour: Colour = WHITE) -> Shape:
+def make_lines(
+    name: str,
+    ends: AnyArray,
+    width: float,
+    colour: Colour = WHITE,
+) -> Shape:
     """Return a shape of separate lines.
 
     Args:
@@ -76,11 +81,20 @@ def make_lines(name: str, ends: AnyArray, width: float, colour: Colour = WHITE) 
         width: Width of the lines, in m.
         colour: Colour of the lines.
     """
-    return Shape(name, Marker.LINE_LIST, (width, 0.0, 0.0), ends.reshape(-1, 3), colour=colour)
+    return Shape(
+        name,
+        Marker.LINE_LIST,
+        (width, 0.0, 0.0),
+        ends.reshape(-1, 3),
+        colour=colour,
+    )
 
 
 def make_text(
-    name: str, text: str, height: float, position: Sequence[float] | Array = (0.0, 0.0, 0.0)
+    name: str,
+    text: str,
+    height: float,
+    position: Sequence[float] | Array = (0.0, 0.0, 0.0),
 ) -> Shape:
     """Return a shape that shows a text, which always faces the viewer.
 
@@ -92,7 +106,13 @@ def make_text(
     """
     # RViz 2 draws a space half as wide as scale.x, and more than a metre wide if scale.x is 0.
     scale = (0.5 * height, 0.0, height)
-    return Shape(name, Marker.TEXT_VIEW_FACING, scale, position=position, text=text)
+    return Shape(
+        name,
+        Marker.TEXT_VIEW_FACING,
+        scale,
+        position=position,
+        text=text,
+    )
 
 
 def serialise(frame_id: str, shapes: Sequence[Shape]) -> bytes:

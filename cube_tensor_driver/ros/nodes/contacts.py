@@ -81,7 +81,12 @@ class Contacts(SkinSubscriberNode):
         newest = skin.newest
         values = newest.usable_values(health)
         frame_id = skin.info.header.frame_id
-        finder.update(1e-9 * skin.stamp_ns, values, newest.left_out, newest.status)
+        finder.update(
+            1e-9 * skin.stamp_ns,
+            values,
+            newest.left_out,
+            newest.status,
+        )
         # Computing the point cloud takes time, so it is done only while somebody subscribes.
         if self._has_traction_listeners():
             cloud = finder.cloud(values)
@@ -106,7 +111,11 @@ class Contacts(SkinSubscriberNode):
     def _make_message(self, skin: FollowedSkin, finder: ContactFinder) -> SkinContacts:
         frame_id = skin.info.header.frame_id
         return make_contacts_message(
-            make_message, skin.stamp_ns, frame_id, finder.contacts, finder.slip
+            make_message,
+            skin.stamp_ns,
+            frame_id,
+            finder.contacts,
+            finder.slip,
         )
 
     def _take_finder(self) -> ContactFinder | None:
@@ -136,7 +145,15 @@ class Contacts(SkinSubscriberNode):
         if self._take_finder() is not None or not self._problem:
             return []
         text = f"no contacts: {self._problem}"
-        return [make_status("contact finder", "", DiagnosticStatus.ERROR, text, {})]
+        return [
+            make_status(
+                "contact finder",
+                "",
+                DiagnosticStatus.ERROR,
+                text,
+                {},
+            )
+        ]
 
     def _has_traction_listeners(self) -> bool:
         return bool(self._traction.get_subscription_count())

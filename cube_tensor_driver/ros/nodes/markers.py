@@ -35,7 +35,13 @@ class Markers(SkinSubscriberNode):
     def configure(self) -> None:
         self._quantity = scene.QUANTITIES[self.value("quantity")]
         self._contacts: SkinContacts | None = None
-        contacts = CheckedSubscription(self, SkinContacts, "contacts", self._on_contacts, 2)
+        contacts = CheckedSubscription(
+            self,
+            SkinContacts,
+            "contacts",
+            self._on_contacts,
+            2,
+        )
         self.call_at_cleanup(contacts.close)
         super().configure()
 
@@ -53,7 +59,14 @@ class Markers(SkinSubscriberNode):
         top = fixed or scene.choose_automatic_top(self._quantity, shown, last)
         ranges = self._ranges = self._ranges.follow(values, residual, top)
         contacts = self._find_newest_contacts(skin)
-        return self._canvas.draw(self._quantity, shown, values, ranges, health, contacts)
+        return self._canvas.draw(
+            self._quantity,
+            shown,
+            values,
+            ranges,
+            health,
+            contacts,
+        )
 
     def _find_newest_contacts(self, skin: FollowedSkin) -> SkinContacts | None:
         """Return the newest contacts; None if no message of `contacts` has arrived, or the newest

@@ -123,9 +123,18 @@ class Reconstruction(CubeNode):
             self._publish_info,
         )
         self._diagnostics = ReconstructionDiagnostics(
-            skin, self._reconstructor, self._taring, self._lost
+            skin,
+            self._reconstructor,
+            self._taring,
+            self._lost,
         )
-        info = CheckedSubscription(self, SkinInfo, "driver/info", self._taring.on_info, LATCHED)
+        info = CheckedSubscription(
+            self,
+            SkinInfo,
+            "driver/info",
+            self._taring.on_info,
+            LATCHED,
+        )
         self.call_at_cleanup(info.close)
         if self._subscribes:
             frequencies = self.create_subscription(

@@ -65,7 +65,12 @@ class SkinWrenches:
         names: Names of the cubes, then that of the skin.
     """
 
-    def __init__(self, skin: Skin, side: float | None, stale_s: float) -> None:
+    def __init__(
+        self,
+        skin: Skin,
+        side: float | None,
+        stale_s: float,
+    ) -> None:
         """Prepare the wrenches of a skin.
 
         Args:

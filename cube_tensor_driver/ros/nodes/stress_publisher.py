@@ -132,7 +132,13 @@ class ForceCloud:
         # The message is made once, and later only its data and stamp are replaced. The description
         # of its fields consists of many Python objects that never change.
         points = np.zeros((len(skin.cubes), len(FORCE_FIELDS)))
-        self._message = make_cloud_message(make_message, 0, skin.parent_frame, FORCE_FIELDS, points)
+        self._message = make_cloud_message(
+            make_message,
+            0,
+            skin.parent_frame,
+            FORCE_FIELDS,
+            points,
+        )
 
     def publish(self, rows: StressRows, stamp_ns: int) -> None:
         """Publish the force of the last row of each cube; it is NaN for cubes without a row.
