@@ -162,7 +162,8 @@ def rotate_loads(
 
 
 def sum_rotated(
-    circular: NDArray[np.complex64], rotation: NDArray[np.complexfloating]
+    circular: NDArray[np.complex64],
+    rotation: NDArray[np.complexfloating],
 ) -> tuple[Array, Array]:
     """Sum the stresses and gradients of several loads, given as circular components.
 

@@ -127,7 +127,13 @@ def disc(
         ElasticError: `radius` is not positive or `order` is below 1.
     """
     nodes, weights = _compute_gauss_points(order)
-    return _place_rings(radius, np.sqrt(nodes), weights, force, centre)
+    return _place_rings(
+        radius,
+        np.sqrt(nodes),
+        weights,
+        force,
+        centre,
+    )
 
 
 def hertz(
@@ -148,7 +154,13 @@ def hertz(
     # is then smooth at the rim, where the pressure p as a function of r has a vertical slope.
     radii = np.sqrt(1.0 - nodes**2)
     fractions = 3.0 * weights * nodes**2
-    return _place_rings(radius, radii, fractions, force, centre)
+    return _place_rings(
+        radius,
+        radii,
+        fractions,
+        force,
+        centre,
+    )
 
 
 def hertz_order(radius: float, depth: float) -> int:

@@ -258,7 +258,14 @@ class ContactResponse:
         Returns:
             Components (N, 15) in Pa.
         """
-        circular = self._respond_fast(self._rows, self._order, place, angle, size, force)
+        circular = self._respond_fast(
+            self._rows,
+            self._order,
+            place,
+            angle,
+            size,
+            force,
+        )
         return self._cubes.measure(_split(circular), variant)[:, 0]
 
     def sensitivity(
@@ -282,7 +289,14 @@ class ContactResponse:
             Changes (N, S, 15) in Pa for one standard deviation of each of S quantities: depth,
             Poisson's ratio and, in a layer of finite thickness, the thickness.
         """
-        circular = self._respond_fast(self._sensitivity_rows, ORDERS, place, angle, size, force)
+        circular = self._respond_fast(
+            self._sensitivity_rows,
+            ORDERS,
+            place,
+            angle,
+            size,
+            force,
+        )
         return np.asarray(_split(circular) @ self._point_matrix)
 
     def _respond_fast(

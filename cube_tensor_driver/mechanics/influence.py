@@ -99,7 +99,11 @@ class Influence:
         grid_shape = [len(axis) for axis in axes]
         grid = nodes.reshape(*grid_shape, *nodes.shape[1:])
         return RegularGridInterpolator(
-            tuple(axes), grid, "cubic", bounds_error=False, fill_value=0.0
+            tuple(axes),
+            grid,
+            "cubic",
+            bounds_error=False,
+            fill_value=0.0,
         )
 
 

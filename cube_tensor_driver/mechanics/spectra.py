@@ -269,4 +269,11 @@ def layer_spectra(
     x, y, z = np.moveaxis(rotated, -1, 0)
     plus = x.imag - y.real
     minus = -x.imag - y.real
-    return Spectra(k, weight, ORDERS, plus, minus, z.real)
+    return Spectra(
+        k,
+        weight,
+        ORDERS,
+        plus,
+        minus,
+        z.real,
+    )

@@ -61,7 +61,12 @@ class BackgroundHubs:
         cubes = len(skin.cubes)
         unloaded = np.zeros((cubes, 6)), np.zeros((cubes, 6, 3))
         self._load = _SetLoad(unloaded)
-        self._simulator = Simulator(skin, self._load, Path(ports), PadErrors(noise, drift))
+        self._simulator = Simulator(
+            skin,
+            self._load,
+            Path(ports),
+            PadErrors(noise, drift),
+        )
         self._stop = StopRequest()
         self._thread = threading.Thread(
             target=self._simulator.run,

@@ -100,7 +100,13 @@ class SimulatedHub:
         n_pads = self.n_pads + self.extra_pads
         uids = np.array(self.cube_uids, "<u8")
         return encode(
-            Hello(uid, FIRMWARE, n_pads, self.period_us, uids),
+            Hello(
+                uid,
+                FIRMWARE,
+                n_pads,
+                self.period_us,
+                uids,
+            ),
             self.version,
         )
 
@@ -186,7 +192,14 @@ class SimulatedHub:
         n = len(frequency)
         pad_fault = np.zeros(n, "<u4") if self.pad_fault is None else self.pad_fault
         temperature = np.full(n, self.celsius, "<i2")
-        sample = Sample(sequence, 0, device_us, frequency, pad_fault, temperature)
+        sample = Sample(
+            sequence,
+            0,
+            device_us,
+            frequency,
+            pad_fault,
+            temperature,
+        )
         return encode(sample, self.version)
 
     def _log_sample(self) -> None:

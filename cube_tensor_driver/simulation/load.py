@@ -118,7 +118,11 @@ class AnyLoad(Fields, Protocol):
         """
 
 
-def read_load(skin: Skin, script: Path | None, scene: Path | None = None) -> AnyLoad:
+def read_load(
+    skin: Skin,
+    script: Path | None,
+    scene: Path | None = None,
+) -> AnyLoad:
     """Read the load on a skin.
 
     Args:

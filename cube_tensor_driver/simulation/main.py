@@ -62,7 +62,12 @@ def _make_parser() -> argparse.ArgumentParser:
         prog="simulator", description="Simulated hubs of a skin on pseudo-terminals."
     )
     add = parser.add_argument
-    add("--config", type=Path, required=True, help="skin file")
+    add(
+        "--config",
+        type=Path,
+        required=True,
+        help="skin file",
+    )
     add(
         "--ports",
         type=Path,

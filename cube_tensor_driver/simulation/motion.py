@@ -43,7 +43,12 @@ def read_weight(name: str, n_pads: int) -> Array:
     Raises:
         ConfigError: There is no such file, it states no weight, or is for another number of pads.
     """
-    path = find_shipped("weight/*.yaml", name, Path(), "a file of ./cube fem --weight")
+    path = find_shipped(
+        "weight/*.yaml",
+        name,
+        Path(),
+        "a file of ./cube fem --weight",
+    )
     model = read_calibration(path).weight
     if model is None or model.n_pads != n_pads:
         raise ConfigError(

@@ -61,18 +61,37 @@ def simulate(
     # The limits of a hub are sample periods; the longest period gives the lowest rate.
     low, high = (1e6 / limit for limit in reversed(PERIOD_LIMITS_US))
     check_number(
-        "rate", rate, lambda x: low <= x <= high, f"{low:g} to {high:g} samples per second"
+        "rate",
+        rate,
+        lambda x: low <= x <= high,
+        f"{low:g} to {high:g} samples per second",
     )
     if duration is not None:
-        check_number("duration", duration, lambda x: x > 0, "a time greater than 0 s, or None")
-    check_number("noise", noise, lambda x: 0 <= x < math.inf, "a number of at least 0")
+        check_number(
+            "duration",
+            duration,
+            lambda x: x > 0,
+            "a time greater than 0 s, or None",
+        )
+    check_number(
+        "noise",
+        noise,
+        lambda x: 0 <= x < math.inf,
+        "a number of at least 0",
+    )
     check_number("drift", drift, math.isfinite, "a finite number")
 
     # The cubes are created again in each iteration. Creating them here, too, raises errors of the
     # skin before the first iteration.
     make_hub_cubes(skin)
     errors = PadErrors(noise, drift, imperfections)
-    return SimulatedSource(skin, load, round(1e6 / rate), duration, errors)
+    return SimulatedSource(
+        skin,
+        load,
+        round(1e6 / rate),
+        duration,
+        errors,
+    )
 
 
 @dataclass

@@ -265,16 +265,36 @@ class MujocoSkin:
         if len(place) > 1:
             # A round contact of the same area also describes this flat contact, for callers that
             # need only its centre and force.
-            polygon = make_flat_contact(place, force, normal, MIN_WIDTH_DEPTHS * self.depth)
+            polygon = make_flat_contact(
+                place,
+                force,
+                normal,
+                MIN_WIDTH_DEPTHS * self.depth,
+            )
             pressure = -float(polygon.traction @ normal)
             radius = math.sqrt(pressing / pressure / math.pi)
-            load = ContactLoad("disc", polygon.centre, normal, total, radius)
+            load = ContactLoad(
+                "disc",
+                polygon.centre,
+                normal,
+                total,
+                radius,
+            )
             return BodyContact(part.body, load, polygon)
         # For a Hertz contact, the curvatures (1 / radius) of both bodies add up (Johnson 4.2).
         geoms = self.data.contact.geom[rows[0]]
         curvature = self._curvature[geoms].sum()
         radius = hertz_radius(pressing, curvature, self._stiffness)
-        return BodyContact(part.body, ContactLoad("sphere", place[0], normal, total, radius))
+        return BodyContact(
+            part.body,
+            ContactLoad(
+                "sphere",
+                place[0],
+                normal,
+                total,
+                radius,
+            ),
+        )
 
     def _find_contact_points(
         self,
