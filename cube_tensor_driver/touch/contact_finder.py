@@ -104,7 +104,13 @@ class ContactFinder(Protocol):
     def slip(self) -> Slip:
         """Newest slip state and friction of `contacts`; empty if the method is interpolation."""
 
-    def update(self, time_s: float, values: Array, left_out: PadMasks, status: StatusBits) -> None:
+    def update(
+        self,
+        time_s: float,
+        values: Array,
+        left_out: PadMasks,
+        status: StatusBits,
+    ) -> None:
         """Find the contacts in the newest values.
 
         Args:
@@ -174,7 +180,13 @@ class _InterpolationFinder:
         self.contacts: list[Contact] = []
         self.slip = NO_CONTACTS
 
-    def update(self, time_s: float, values: Array, left_out: PadMasks, status: StatusBits) -> None:
+    def update(
+        self,
+        time_s: float,
+        values: Array,
+        left_out: PadMasks,
+        status: StatusBits,
+    ) -> None:
         self.contacts = self._surface.contacts(values, self._threshold)
 
     def follow(self, time_s: float, values: Array) -> bool:
@@ -206,7 +218,13 @@ class _InverseFinder:
         by_pad = compute_noise_of_all_pads(calibrations)
         self._pipeline = Pipeline(calibrations)
         self._left_out = np.zeros(len(calibrations), np.uint32)
-        self._inverse = SurfaceInverse.from_poses(poses, by_pad, layer, depth, model=model)
+        self._inverse = SurfaceInverse.from_poses(
+            poses,
+            by_pad,
+            layer,
+            depth,
+            model=model,
+        )
         self._tracker = ContactTracker(self._inverse, settings.least)
         self._slip = SlipEstimator(self._inverse)
         self.contacts: list[TrackedContact] = []
@@ -215,7 +233,13 @@ class _InverseFinder:
     def slip(self) -> Slip:
         return self._slip.slip
 
-    def update(self, time_s: float, values: Array, left_out: PadMasks, status: StatusBits) -> None:
+    def update(
+        self,
+        time_s: float,
+        values: Array,
+        left_out: PadMasks,
+        status: StatusBits,
+    ) -> None:
         # The noise of a cube's components depends on the pads in use. So the noise matrices are
         # computed again for cubes whose pads in use have changed since the last scan.
         changed = np.flatnonzero(left_out != self._left_out)

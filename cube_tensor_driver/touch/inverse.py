@@ -141,7 +141,14 @@ class SurfaceInverse:
             layer = influence.layer
             depth = influence.depth
             model = model_pads(influence, skin.calibrations)
-        self._set_up(skin.poses, by_pad, layer, depth, side, model)
+        self._set_up(
+            skin.poses,
+            by_pad,
+            layer,
+            depth,
+            side,
+            model,
+        )
 
     @classmethod
     def from_poses(
@@ -165,7 +172,14 @@ class SurfaceInverse:
                 points.
         """
         inverse = cls.__new__(cls)
-        inverse._set_up(poses, by_pad, layer, depth, side, model)
+        inverse._set_up(
+            poses,
+            by_pad,
+            layer,
+            depth,
+            side,
+            model,
+        )
         return inverse
 
     def __repr__(self) -> str:
@@ -229,7 +243,10 @@ class SurfaceInverse:
         self._has_other_pads = np.zeros(n, bool)
 
         observation = ObservationModel(
-            self.columns, self.observed, self._all_pads, self._whole_variant
+            self.columns,
+            self.observed,
+            self._all_pads,
+            self._whole_variant,
         )
         self._windows = WindowPosteriors(
             TractionPrior(self._cubes),

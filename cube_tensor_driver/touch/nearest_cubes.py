@@ -10,7 +10,11 @@ from ..core.arrays import Index
 from ..core.poses import CubePoses
 
 
-def find_nearest_cubes(poses: CubePoses, count: int, by_position: bool = False) -> Index:
+def find_nearest_cubes(
+    poses: CubePoses,
+    count: int,
+    by_position: bool = False,
+) -> Index:
     """Return the indices (cubes, W) of the cubes nearest to each cube, which itself comes first.
 
     Args:

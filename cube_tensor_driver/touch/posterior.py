@@ -87,7 +87,10 @@ class ObservationModel(NamedTuple):
             cubes: Indices (...) of the cubes. Their axes replace the leading axis n of the arrays.
         """
         return ObservationModel(
-            self.columns, self.known[cubes], self.by_pad[cubes], self.variant[cubes]
+            self.columns,
+            self.known[cubes],
+            self.by_pad[cubes],
+            self.variant[cubes],
         )
 
 
@@ -163,7 +166,13 @@ class WindowPosteriors:
             # because a list of all of them would double the memory.
             for number, one in enumerate(first):
                 own = model.select(self.near[one])
-                window = _solve_window(traction_prior, own, place[one], angle[one], points)
+                window = _solve_window(
+                    traction_prior,
+                    own,
+                    place[one],
+                    angle[one],
+                    points,
+                )
                 for name, array in window._asdict().items():
                     if name not in solved:
                         shape = (len(first), *array.shape)
@@ -349,7 +358,13 @@ def _solve_window(
     known = model.known.ravel()
     pads = np.nan_to_num(model.by_pad)
 
-    unit_prior = covariance_matrix(traction_prior, columns, place, angle, model.variant)
+    unit_prior = covariance_matrix(
+        traction_prior,
+        columns,
+        place,
+        angle,
+        model.variant,
+    )
     prior = AMPLITUDE**2 * unit_prior
     total = prior.copy()  # becomes the covariance K_yy + N of the measured values
     for cube, own in enumerate(pads):
@@ -361,7 +376,13 @@ def _solve_window(
 
     # `known_gain` is the gain matrix G = K_ty (K_yy + N)^-1 for the known values, and `variance`
     # the posterior variance diag(K_tt - G K_yt) of the traction.
-    cross = _compute_cross_covariance(traction_prior, model, place, angle, points)
+    cross = _compute_cross_covariance(
+        traction_prior,
+        model,
+        place,
+        angle,
+        points,
+    )
     cross = cross[:, known]
     known_block = np.ix_(known, known)
     # Cholesky takes a quarter of the time of numpy's general solver.

@@ -133,7 +133,15 @@ class MissingValuePrediction:
         pads = windows.pads[near]
         by_pad = np.einsum("fwc,wcp->fwp", by_cube, pads)
         by_pad = by_pad.reshape(n_own, -1)
-        prediction = _Prediction(cube, own, near, weights, by_pad, rows, gain)
+        prediction = _Prediction(
+            cube,
+            own,
+            near,
+            weights,
+            by_pad,
+            rows,
+            gain,
+        )
         self._predictions.append(prediction)
 
     def fill(self, y: Single) -> Single:

@@ -262,7 +262,12 @@ class SlipEstimator:
         contacts["is_fitted"] |= slips
         shear_ratio = after[:, 3:6]
         ratios = _compute_lengths(shear_ratio)
-        _add_ratio(contacts, slips, ratios, contacts["ratio_deviation"])
+        _add_ratio(
+            contacts,
+            slips,
+            ratios,
+            contacts["ratio_deviation"],
+        )
 
     def update(self, time_s: float, values: Array) -> bool:
         """Estimate `slip` from the values of a scan.

@@ -171,7 +171,12 @@ class Touch:
             ElasticError: The elastomer of the skin file is impossible.
         """
         allowed = "a number above 0, per hour"
-        check_number("false_alarms", false_alarms, lambda x: 0 < x < math.inf, allowed)
+        check_number(
+            "false_alarms",
+            false_alarms,
+            lambda x: 0 < x < math.inf,
+            allowed,
+        )
         skin = as_skin(skin)
         n = len(skin.calibrations)
         rate_hz = skin.rate or DEFAULT_RATE_HZ

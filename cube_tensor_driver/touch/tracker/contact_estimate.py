@@ -93,7 +93,12 @@ def discs_of(estimates: Sequence[ContactEstimate]) -> Discs:
     return Discs(forces, centres, log_squares / 2)
 
 
-def estimate_contact(nodes: Array, forces: Array, root: Array, size: float) -> ContactEstimate:
+def estimate_contact(
+    nodes: Array,
+    forces: Array,
+    root: Array,
+    size: float,
+) -> ContactEstimate:
     """Integrate the traction on nodes (small Hertz contacts on a grid) over one contact.
 
     Args:

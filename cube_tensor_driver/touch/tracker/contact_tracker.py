@@ -531,7 +531,10 @@ class ContactTracker:
         )
 
     def _to_parent_frame(
-        self, estimate: ContactEstimate, fit: HertzFit | NodeFit, is_refined: bool
+        self,
+        estimate: ContactEstimate,
+        fit: HertzFit | NodeFit,
+        is_refined: bool,
     ) -> TrackedContact:
         """Convert an estimate from the flattened skin to the skin's parent frame.
 

@@ -35,7 +35,9 @@ below the standard deviation of the pressure.
 
 
 def add_fits(
-    inverse: SurfaceInverse, residual: TractionField, fits: list[HertzFit | NodeFit]
+    inverse: SurfaceInverse,
+    residual: TractionField,
+    fits: list[HertzFit | NodeFit],
 ) -> TractionField:
     """Add the traction of fits of regions to the residual field, which the fits do not explain.
 
@@ -88,7 +90,9 @@ def fit_variances(inverse: SurfaceInverse, fits: list[HertzFit | NodeFit]) -> Ar
 
 
 def _distribute(
-    inverse: SurfaceInverse, fit: HertzFit | NodeFit, contacts: ContactSum
+    inverse: SurfaceInverse,
+    fit: HertzFit | NodeFit,
+    contacts: ContactSum,
 ) -> tuple[Index, Array, Array, Array]:
     """Return the effect of the q contacts of a fit at the m points of the surface around it.
 

@@ -147,7 +147,12 @@ class HertzFit:
 
     linear: Linearisation
 
-    def __init__(self, inverse: SurfaceInverse, values: LocalValues, starts: Discs) -> None:
+    def __init__(
+        self,
+        inverse: SurfaceInverse,
+        values: LocalValues,
+        starts: Discs,
+    ) -> None:
         """Prepare a fit that begins at `starts`.
 
         To improve these contacts, call `linearise`, then `step` (a Gauss-Newton step).
@@ -488,7 +493,10 @@ def linearise(inverse: SurfaceInverse, fits: Sequence[HertzFit]) -> None:
 
 
 def _linearise_alike(
-    inverse: SurfaceInverse, fits: list[HertzFit], contacts: int, cubes: int
+    inverse: SurfaceInverse,
+    fits: list[HertzFit],
+    contacts: int,
+    cubes: int,
 ) -> None:
     """Linearise the response of the cubes for K fits with equal numbers of contacts and cubes.
 
@@ -517,7 +525,13 @@ def _linearise_alike(
     all_sizes = np.repeat(sizes, cubes)
     all_forces = forces.reshape(-1, 3)
     all_forces = np.repeat(all_forces, cubes, axis=0)
-    slopes = response.response_slopes(positions, angles, variants, all_sizes, all_forces)
+    slopes = response.response_slopes(
+        positions,
+        angles,
+        variants,
+        all_sizes,
+        all_forces,
+    )
     slopes = slopes[:, :, inverse.columns]
     # The response is not linear in the depth. Its change from the stated depth to the one found
     # follows from the derivative halfway between these two depths. In a half space, this derivative
@@ -526,7 +540,12 @@ def _linearise_alike(
     depth_errors = np.array([fit.depth_error for fit in fits])
     halfway = np.repeat(1 + depth_errors / 2, contacts * cubes)
     near_positions = positions / halfway[:, None]
-    sensitivity = response.sensitivity(near_positions, angles, all_sizes / halfway, all_forces)
+    sensitivity = response.sensitivity(
+        near_positions,
+        angles,
+        all_sizes / halfway,
+        all_forces,
+    )
     sensitivity[:, :, len(STRESS) :] /= halfway[:, None, None]
     sensitivity = sensitivity[:, :, inverse.columns]
 

@@ -170,7 +170,13 @@ class LocalValues:
     known: Mask
     count: int
 
-    def __init__(self, inverse: SurfaceInverse, noise: CubeNoise, home: int, cubes: Index) -> None:
+    def __init__(
+        self,
+        inverse: SurfaceInverse,
+        noise: CubeNoise,
+        home: int,
+        cubes: Index,
+    ) -> None:
         """Collect the noise of the cubes.
 
         Args:

@@ -141,7 +141,12 @@ class NodeFit:
     misfit: float
     labels: Index
 
-    def __init__(self, inverse: SurfaceInverse, points: Index, values: LocalValues) -> None:
+    def __init__(
+        self,
+        inverse: SurfaceInverse,
+        points: Index,
+        values: LocalValues,
+    ) -> None:
         """Compute the response of the cubes to the nodes.
 
         Args:
@@ -402,7 +407,11 @@ class NodeFit:
         return design, eigenvalues, vectors, basis
 
 
-def _place_nodes(region: Array, around: Array, inverse: SurfaceInverse) -> tuple[Array, float]:
+def _place_nodes(
+    region: Array,
+    around: Array,
+    inverse: SurfaceInverse,
+) -> tuple[Array, float]:
     """Place nodes (small contacts) on a region, and beyond the border of the skin next to it.
 
     Args:

@@ -196,7 +196,14 @@ class TrackedRegion:
         self._steps = 0
         self._updated_peak = 1.0
         self.start: tuple[int, Discs]
-        self._responded = -1, Discs(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0))
+        self._responded = (
+            -1,
+            Discs(
+                np.zeros((0, 3)),
+                np.zeros((0, 2)),
+                np.zeros(0),
+            ),
+        )
 
     def begin_scan(self, points: Index, peak: float) -> None:
         """Begin a new scan (set of values of all cubes), and move Hertz contacts to where they are
@@ -438,7 +445,11 @@ class TrackedRegion:
             covariance = one.force_covariance + np.outer(change, change)
             moment = (1 + growth) * one.moment
             scaled.append(
-                one._replace(force=one.force + change, force_covariance=covariance, moment=moment)
+                one._replace(
+                    force=one.force + change,
+                    force_covariance=covariance,
+                    moment=moment,
+                )
             )
         return scaled
 
@@ -496,7 +507,12 @@ class TrackedRegion:
             self._accept(fit)
             self._first_misfit = MAX_HERTZ_MISFIT / MAX_MISFIT_GROWTH
 
-    def subtract_others(self, values: LocalValues, total: Array, deviation: Array) -> None:
+    def subtract_others(
+        self,
+        values: LocalValues,
+        total: Array,
+        deviation: Array,
+    ) -> None:
         """Set `others`, the response to all other regions.
 
         The fit of this region subtracts it from the C measured components of each of its cubes.
@@ -592,7 +608,9 @@ class TrackedRegion:
 
 
 def update_responses(
-    inverse: SurfaceInverse, regions: Sequence[TrackedRegion], cubes: Index
+    inverse: SurfaceInverse,
+    regions: Sequence[TrackedRegion],
+    cubes: Index,
 ) -> None:
     """Compute the response of cubes (change of their components, in Pa) to regions of contact.
 
