@@ -113,7 +113,12 @@ def run_demo(settings: DemoSettings) -> int:
 
             try:
                 measurement = watch(
-                    settings, skin_file, rate, children, interrupted, folder / "log.json"
+                    settings,
+                    skin_file,
+                    rate,
+                    children,
+                    interrupted,
+                    folder / "log.json",
                 )
             except Interrupted:
                 # Without a duration, Ctrl-C is the normal end of a demo.

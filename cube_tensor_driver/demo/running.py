@@ -64,7 +64,13 @@ class Observer:
             receive: Function that is called with each message in its serialised form (CDR).
             quality: Quality of service of the subscription.
         """
-        self.node.create_subscription(kind, topic, receive, quality, raw=True)
+        self.node.create_subscription(
+            kind,
+            topic,
+            receive,
+            quality,
+            raw=True,
+        )
 
     def log_error(self, text: str) -> None:
         """Write an error message to the log of the ROS node."""
@@ -119,7 +125,13 @@ def observing(
         on_step: Function that `Observer.spin` calls repeatedly while it receives messages.
     """
     with node_session(name) as (node, executor):
-        yield Observer(node, executor, children, interrupted, on_step)
+        yield Observer(
+            node,
+            executor,
+            children,
+            interrupted,
+            on_step,
+        )
 
 
 def end_simulator(children: Children, log: Path) -> SampleLog:

@@ -144,16 +144,32 @@ def watch(
     with ExitStack() as stack:
         table = stack.enter_context(LiveTable(skin, show=not settings.headless))
         observer = stack.enter_context(
-            observing("demo", children, interrupted=interrupted, on_step=table.refresh)
+            observing(
+                "demo",
+                children,
+                interrupted=interrupted,
+                on_step=table.refresh,
+            )
         )
-        watcher = SkinWatcher(skin, rate, children, table, observer, verification)
+        watcher = SkinWatcher(
+            skin,
+            rate,
+            children,
+            table,
+            observer,
+            verification,
+        )
         watcher.wait_for_tensors()
         if settings.view:
             watcher.note_address()
         if settings.duration is None or verification is None:
             watcher.run()
         figures = watcher.measure(verification, settings.duration, log)
-    head = {"cubes": len(skin.cubes), "rate_hz": rate, "duration_s": settings.duration}
+    head = {
+        "cubes": len(skin.cubes),
+        "rate_hz": rate,
+        "duration_s": settings.duration,
+    }
     return DemoResult(head | figures, verification)
 
 
@@ -209,9 +225,17 @@ class SkinWatcher:
         profile = batch_profile(rate)
         observer.listen(SkinStress, "stress", self._on_stress, profile)
         if verification is not None:
-            observer.listen(SkinFrequencies, "frequencies", self._on_frequencies, profile)
+            observer.listen(
+                SkinFrequencies,
+                "frequencies",
+                self._on_frequencies,
+                profile,
+            )
             observer.node.create_subscription(
-                DiagnosticArray, "/diagnostics", self._on_diagnostics, 10
+                DiagnosticArray,
+                "/diagnostics",
+                self._on_diagnostics,
+                10,
             )
 
     def wait_for_tensors(self) -> None:

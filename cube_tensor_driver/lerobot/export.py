@@ -108,7 +108,13 @@ def export_lerobot(
             )
             with data_set:
                 for plan in plans:
-                    _write_bag(data_set, plan, topics, choices, report)
+                    _write_bag(
+                        data_set,
+                        plan,
+                        topics,
+                        choices,
+                        report,
+                    )
             data_set.write_meta()
             partial.replace(folder)
     finally:
@@ -335,5 +341,11 @@ def _find_stress_rows(
             # the same throughout.
             if not noted or noted[-1]["ids"] != ids:
                 since_ns = int(known.stamp_ns.min())
-                noted.append({"bag": plan.path.name, "since_ns": since_ns, "ids": ids})
+                noted.append(
+                    {
+                        "bag": plan.path.name,
+                        "since_ns": since_ns,
+                        "ids": ids,
+                    }
+                )
             yield known

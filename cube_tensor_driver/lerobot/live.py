@@ -198,7 +198,12 @@ class LiveWindows:
         """Write the rows (samples of cubes) of one frame as one batch of the Arrow stream."""
         counts = np.bincount(rows.cube, minlength=self._cubes)
         first_frame = np.zeros(len(rows), np.intp)
-        columns = arrange_windows(counts[np.newaxis], int(counts.max()), first_frame, rows)
+        columns = arrange_windows(
+            counts[np.newaxis],
+            int(counts.max()),
+            first_frame,
+            rows,
+        )
         arrays = {name: as_column(values) for name, values in columns.items()}
         batch = pyarrow.record_batch({NUMBER_COLUMN: pyarrow.array([self._number])} | arrays)
         if self._writer is None:
