@@ -238,7 +238,8 @@ class McapReader:
         length = np.minimum(head["length"], len(data)).astype(np.intp)
         message_end = record_begin + RECORD_HEAD.size + length
         is_whole = (message_begin <= message_end) & (message_end <= len(data))
-        (chosen,) = np.nonzero(is_whole & (head["opcode"] == Opcode.MESSAGE))
+        is_message = head["opcode"] == Opcode.MESSAGE
+        (chosen,) = np.nonzero(is_whole & is_message)
         # Recorders write messages of several topics slightly out of the order of their times.
         chosen = chosen[np.argsort(head["recorded_ns"][chosen], kind="stable")]
         return StoredMessages(

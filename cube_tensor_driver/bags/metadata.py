@@ -76,7 +76,8 @@ class Connection:
     def is_latched(self) -> bool:
         """Whether all publishers kept their last messages for subscribers that start later."""
         names = ("transient_local", 1)
-        return bool(self.qos) and all(profile.get("durability") in names for profile in self.qos)
+        durabilities = [profile.get("durability") for profile in self.qos]
+        return bool(durabilities) and all(name in names for name in durabilities)
 
     @property
     def is_best_effort(self) -> bool:
@@ -243,7 +244,10 @@ def write_metadata(
         raise BagError(str(error)) from None
 
 
-def make_bag_information(storage: str, files: Sequence[FileSummary]) -> dict[str, Any]:
+def make_bag_information(
+    storage: str,
+    files: Sequence[FileSummary],
+) -> dict[str, Any]:
     """Return the content of metadata.yaml, with every key that rosbag2 requires.
 
     Args:

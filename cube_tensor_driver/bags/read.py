@@ -351,7 +351,9 @@ class Bag:
             )
 
     def _unpack(
-        self, file: McapReader | SqliteReader, messages: StoredMessages
+        self,
+        file: McapReader | SqliteReader,
+        messages: StoredMessages,
     ) -> Iterator[tuple[int, int, bytes]]:
         """Decompress messages that rosbag2 compressed one by one; damaged ones are left out.
 

@@ -109,7 +109,9 @@ class CompensationReader:
         return self._known.get(wanted_ns, self._default)
 
     def add_forces(
-        self, messages: Decoded[FrequencyRows], recorded: Sequence[RecordedCompensation]
+        self,
+        messages: Decoded[FrequencyRows],
+        recorded: Sequence[RecordedCompensation],
     ) -> Decoded[FrequencyRows]:
         """Return messages of frequencies with the specific force on each cube added to their rows.
 

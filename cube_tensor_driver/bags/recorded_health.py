@@ -105,7 +105,11 @@ class RecordedHealthReader:
                 break
         return health
 
-    def _read_batches_between(self, begin_ns: int, end_ns: int) -> Iterator[_StressBatch]:
+    def _read_batches_between(
+        self,
+        begin_ns: int,
+        end_ns: int,
+    ) -> Iterator[_StressBatch]:
         """Yield the batches of recorded stress that can contain rows with stamps in a span of time.
 
         Batches already in memory come first. The bag is read further only while the caller takes

@@ -69,7 +69,11 @@ class Recording:
                 settings = read_settings(info)
             except MessageError as error:
                 reason = error
-                bag.skip(topic.replace("frequencies", "info"), stamp_ns(info), error)
+                bag.skip(
+                    topic.replace("frequencies", "info"),
+                    stamp_ns(info),
+                    error,
+                )
             else:
                 self.infos.append(info)
                 self.settings.append(settings)

@@ -42,7 +42,8 @@ class StoredMessages:
     def __iter__(self) -> Iterator[tuple[int, int, bytes]]:
         """Yield channel, time of recording in ns, and serialised bytes of each message."""
         columns = (self.channel, self.time_ns, self.begin, self.end)
-        for channel, time_ns, begin, end in zip(*(one.tolist() for one in columns), strict=True):
+        lists = [column.tolist() for column in columns]
+        for channel, time_ns, begin, end in zip(*lists, strict=True):
             yield channel, time_ns, self.data[begin:end]
 
     def select(self, chosen: Any) -> StoredMessages:
@@ -62,15 +63,22 @@ class StoredMessages:
             For each group of M messages: times of recording (M,) in ns, and bytes (M, length).
         """
         sizes = self.end - self.begin
-        bounds = [0, *(np.flatnonzero(np.diff(sizes)) + 1).tolist(), len(self)]
+        changes = np.flatnonzero(np.diff(sizes)) + 1
+        bounds = [0, *changes.tolist(), len(self)]
         for first, last in pairwise(bounds):
             if first < last:
                 size = int(sizes[first])
                 # Row i of `windows` is a view of the `size` bytes that begin at byte i of the data,
                 # so the rows overlap. Only the rows at which messages begin are copied.
-                shape = (len(self.data) - size + 1, size)
-                windows: AnyArray = np.ndarray(shape, np.uint8, self.data, strides=(1, 1))
-                yield self.time_ns[first:last], windows[self.begin[first:last]]
+                n_windows = len(self.data) - size + 1
+                windows: AnyArray = np.ndarray(
+                    (n_windows, size),
+                    np.uint8,
+                    self.data,
+                    strides=(1, 1),
+                )
+                begin = self.begin[first:last]
+                yield self.time_ns[first:last], windows[begin]
 
 
 def join(messages: Sequence[tuple[int, int, bytes]]) -> StoredMessages:

@@ -53,7 +53,8 @@ def summarise_cubes(bag: Bag, topic: str, n_cubes: int) -> Iterator[CubeSummary]
     # The empty first part makes the concatenation below possible for a topic without messages.
     parts = [[np.empty(0, np.int64)] * 3]
     parts += bag.columns(topic, frequency_codec, ("cube", "sequence"))
-    stamp_ns, cube, sequence = (np.concatenate(column) for column in zip(*parts, strict=True))
+    columns = zip(*parts, strict=True)
+    stamp_ns, cube, sequence = map(np.concatenate, columns)
     for number in range(n_cubes):
         rows = cube == number
         n_samples = int(np.count_nonzero(rows))

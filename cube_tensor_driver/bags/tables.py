@@ -83,7 +83,10 @@ def as_array(column: pyarrow.Array) -> AnyArray:
     return values.reshape(-1, *shape)
 
 
-def make_cube_column(rows: FrequencyRows | StressRows, cubes: pyarrow.Array) -> pyarrow.Array:
+def make_cube_column(
+    rows: FrequencyRows | StressRows,
+    cubes: pyarrow.Array,
+) -> pyarrow.Array:
     """Return the Arrow column with the name of the cube of each row (sample of a cube).
 
     Args:

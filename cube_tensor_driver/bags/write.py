@@ -149,7 +149,11 @@ class BagWriter:
     def __enter__(self) -> BagWriter:
         return self
 
-    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
+    def __exit__(
+        self,
+        error: type[BaseException] | None,
+        *_: object,
+    ) -> None:
         # After an error of writing (BagError) the bag cannot be completed, so it is not closed
         # here; `repair` makes it readable later.
         if error is None or not issubclass(error, BagError):

@@ -278,7 +278,8 @@ def fit_creep(
     # The low-pass filter with the shortest relaxation time hardly changes the readings. So an error
     # of its amplitude changes all computed stresses by the same fraction.
     fast = np.zeros_like(amplitude)
-    fast[:, 0] = np.hypot(misfit, FAST_ERROR * amplitude[:, 0])
+    fast_error = FAST_ERROR * amplitude[:, 0]
+    fast[:, 0] = np.hypot(misfit, fast_error)
     deviation = np.array([fast, solution.deviation])
     first_reading = np.outer(means.is_loaded, means.reading[0])
     return CreepFit(
@@ -407,7 +408,8 @@ def _find_memories(
         time: Time constants of the filters, the relaxation times of the law (K,), in s.
         blocks: Numbers of the readings in each of N blocks.
     """
-    ratio = np.diff(seconds)[:, None, None] / time[:, None]
+    steps = np.diff(seconds)
+    ratio = steps[:, None, None] / time[:, None]
     share = relaxed_share(ratio)
     slope_share = 1 - share / ratio
     change = np.diff(reading, axis=0)

@@ -273,9 +273,11 @@ def _read_reference(
         else:
             tensors = [message.tensor for message in messages]
             # The 15 components in the order of `COMPONENTS`, in Pa and Pa/m.
-            rows = [
-                [*_find_axes(t.normal), *_find_axes(t.shear), *t.normal_gradient] for t in tensors
-            ]
+            rows = []
+            for tensor in tensors:
+                normal = _find_axes(tensor.normal)
+                shear = _find_axes(tensor.shear)
+                rows.append([*normal, *shear, *tensor.normal_gradient])
         values = np.array(rows)
     else:
         topics = ", ".join(sorted(types))

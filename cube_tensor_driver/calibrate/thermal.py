@@ -189,7 +189,10 @@ class _Solution:
     misfit: float
 
 
-def read_warming(paths: Sequence[Path], name: str | None) -> dict[str, tuple[Calibration, Warming]]:
+def read_warming(
+    paths: Sequence[Path],
+    name: str | None,
+) -> dict[str, tuple[Calibration, Warming]]:
     """Read bags that were recorded while the temperature of an unloaded skin changed.
 
     Args:
@@ -343,12 +346,14 @@ def _search(
         solutions = (_solve(data, lags, degree, slope) for lags in choices)
         return min(solutions, key=lambda solution: solution.misfit)
 
-    best = solve(itertools.combinations(LAGS_S[::-1].tolist(), n_lags))
+    longest_first = LAGS_S[::-1].tolist()
+    best = solve(itertools.combinations(longest_first, n_lags))
     step = LAGS_S[1] / LAGS_S[0]
     while step > MAX_LAG_STEP:
         near = []
         for factors in itertools.product((1 / step, 1.0, step), repeat=n_lags):
-            lags = tuple(f * lag for f, lag in zip(factors, best.lags, strict=True))
+            scaled = zip(factors, best.lags, strict=True)
+            lags = tuple(factor * lag for factor, lag in scaled)
             # Filters with nearly the same lag would have huge weights of opposite signs.
             if all(a > 1.2 * b for a, b in itertools.pairwise(lags)):
                 near.append(lags)
@@ -377,7 +382,8 @@ def _filter(data: Warming, lags: tuple[float, ...]) -> Array:
             measured = data.temperature[begin:end]
             steps = np.diff(data.seconds[begin:end]) / lag
             decay = np.exp(-steps)
-            rise = np.diff(measured) * (-np.expm1(-steps) / steps)
+            mean_decay = -np.expm1(-steps) / steps
+            rise = np.diff(measured) * mean_decay
             x = measured[0]
             filtered = [x]
             for n, (before, now) in enumerate(itertools.pairwise(measured.tolist())):
@@ -423,7 +429,8 @@ def _solve(
     values = np.linalg.solve(normal, weighted.T @ stress)
 
     residual = (data.stress - columns @ values) * weight[:, None]
-    misfit = 0.5 * np.log((residual**2).mean()) - np.log(weight).mean()
+    mean_square = (residual**2).mean()
+    misfit = 0.5 * np.log(mean_square) - np.log(weight).mean()
     return _Solution(
         lags,
         degree,
@@ -445,7 +452,8 @@ def _describe(data: Warming, best: _Solution) -> ThermalFit:
     residual = data.stress - best.columns @ best.values
     level = best.columns[:, 1]
     behind = data.temperature - data.temperature[0] - level
-    covariance = residual.T @ residual / max(float((behind**2).sum()), 1e-12)
+    sum_of_squares = float((behind**2).sum())
+    covariance = residual.T @ residual / max(sum_of_squares, 1e-12)
     variances, directions = np.linalg.eigh(covariance)
     patterns = directions * np.sqrt(np.maximum(variances, 0))
     # `eigh` returns eigenvalues in rising order, so the largest errors come last.

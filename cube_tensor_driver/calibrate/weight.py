@@ -87,7 +87,8 @@ def fit_weight(path: Path, name: str | None = None) -> WeightFit:
                     f"{path}: it states no motion of the skin; record it while the parameter imu "
                     "or gravity of the reconstruction is set"
                 )
-            stress = np.where(is_absent[rows.cube], 0, pipeline.pad_stress(rows))
+            pad_stress = pipeline.pad_stress(rows)
+            stress = np.where(is_absent[rows.cube], 0, pad_stress)
             blocks.add(rows, np.hstack([stress, rows.specific_force]))
 
     responses = []

@@ -65,7 +65,11 @@ class ContactWriter:
         self._contacts = f"{topics}contacts"
         self._traction = f"{topics}traction"
         writer.add_topic(self._contacts, CONTACTS, [quality()])
-        writer.add_topic(self._traction, TRACTION, [quality(depth=2)])
+        writer.add_topic(
+            self._traction,
+            TRACTION,
+            [quality(depth=2)],
+        )
         self._geometry: list[object] | None = None
         self._finder: ContactFinder | None = None
         self._frame_id = ""

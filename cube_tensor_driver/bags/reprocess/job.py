@@ -431,7 +431,10 @@ def _measure_rest(
     return np.where(exists, mean, np.nan)
 
 
-def _replace_settings(infos: list[Any], settings: list[Settings]) -> Iterator[Any]:
+def _replace_settings(
+    infos: list[Any],
+    settings: list[Settings],
+) -> Iterator[Any]:
     """Yield the recorded SkinInfo messages with replaced calibrations and rest frequencies.
 
     A rest frequency is the frequency of a pad without load.

@@ -44,7 +44,11 @@ class RecordedReconstruction:
         """Close the bag."""
         self._source.bag.close()
 
-    def health_at(self, rows: FrequencyRows, reconstructor: Reconstructor) -> RecordedHealth:
+    def health_at(
+        self,
+        rows: FrequencyRows,
+        reconstructor: Reconstructor,
+    ) -> RecordedHealth:
         """Return the recorded health (which pads were left out, and why) for rows of one message.
 
         The rest frequencies (without load) that applied when these rows were recorded are set in
@@ -64,7 +68,11 @@ class RecordedReconstruction:
             reconstructor.rest_frequency = settings.rest_frequency
         return self._source.recording.health_at(rows)
 
-    def compensation_at(self, stamp_ns: int, reconstructor: Reconstructor) -> Motion | None:
+    def compensation_at(
+        self,
+        stamp_ns: int,
+        reconstructor: Reconstructor,
+    ) -> Motion | None:
         """Return the recorded motion of the skin, which the compensation of its weight requires.
 
         The recorded states of creep and temperature are set in the reconstructor.

@@ -109,7 +109,10 @@ def frequency_table(source: BagSource) -> pyarrow.Table:
     return pyarrow.concat_tables(parts, promote_options="default")
 
 
-def reprocess_table(frequencies: pyarrow.Table, skin: CalibratedSkin) -> pyarrow.Table:
+def reprocess_table(
+    frequencies: pyarrow.Table,
+    skin: CalibratedSkin,
+) -> pyarrow.Table:
     """Compute the stress of one recording of one skin, from an Arrow table to an Arrow table.
 
     The result depends on the arguments only, so frameworks such as Ray or Dask can call this
