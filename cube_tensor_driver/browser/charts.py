@@ -192,12 +192,15 @@ class Charts:
         for number, chart in enumerate(charts):
             plot = self._plots[number]
             # A plot is made only when its chart has lines; until then both lists are empty.
-            plotted = [one["label"] for one in plot.series[1:]] if plot is not None else []
+            series = plot.series[1:] if plot is not None else ()
+            plotted = [one["label"] for one in series]
             if plotted == list(chart.lines):
                 continue
             if plot is not None:
                 plot.remove()
-            new[f"chart {number}"] = self._plots[number] = self._add_plot(chart, 2 + 2 * number)
+            plot = self._add_plot(chart, 2 + 2 * number)
+            self._plots[number] = plot
+            new[f"chart {number}"] = plot
         return new
 
     def _add_plot(self, chart: Chart, order: float) -> viser.GuiUplotHandle:
@@ -295,14 +298,17 @@ def make_chart_properties(history: History, chart: Chart) -> dict[str, Any]:
     # The range is computed here, because uPlot cannot compute it from values with NaN.
     finite = np.concatenate(values)
     finite = finite[np.isfinite(finite)]
-    low, high = round_range(finite.min(initial=0.0), finite.max(initial=0.0))
+    lowest = finite.min(initial=0.0)
+    highest = finite.max(initial=0.0)
+    low, high = round_range(lowest, highest)
     if history.count // RELAYOUT_PERIOD % 2:
         high += 1e-9 * (high - low)
     return {"data": (history.times, *values), "scales": _make_scales(low, high)}
 
 
 def _make_scales(low: float, high: float) -> dict[str, uplot.Scale]:
-    return {"x": TIME_SCALE, "y": uplot.Scale(auto=False, range=(low, high))}
+    value_scale = uplot.Scale(auto=False, range=(low, high))
+    return {"x": TIME_SCALE, "y": value_scale}
 
 
 def format_csv(
@@ -331,5 +337,12 @@ def format_csv(
             header += f",{names[cube]} {name} / {unit}"
             columns.append(history.of(cube, column))
     content = io.BytesIO()
-    np.savetxt(content, np.column_stack(columns), "%.6g", ",", header=header, comments="")
+    np.savetxt(
+        content,
+        np.column_stack(columns),
+        fmt="%.6g",
+        delimiter=",",
+        header=header,
+        comments="",
+    )
     return content.getvalue()

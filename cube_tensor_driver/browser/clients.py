@@ -201,7 +201,12 @@ class ReplayClient:
         request = SteerReplay.Request(position=position, paused=self.state.paused)
         self._wanted_position = None
         # The page shows the new position, so a jump that succeeds needs no note.
-        self._services.ask(JUMP, self._client, request, notes_success=False)
+        self._services.ask(
+            JUMP,
+            self._client,
+            request,
+            notes_success=False,
+        )
         # Without this assignment, the slider would jump back to the old position until the next
         # state of the replay arrives.
         self.state.position = position

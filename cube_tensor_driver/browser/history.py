@@ -131,12 +131,14 @@ class SampleRate:
         # Numbers of samples continue at 0 after 2**32 - 1. The difference of two uint32 is right in
         # that case, too.
         samples = rows.sequence - self._first_sequence[cube]
-        is_new = (
-            (elapsed_s < 0) | (elapsed_s > MAX_RATE_PERIOD_S) | (samples > MAX_NUMBER_DIFFERENCE)
-        )
+        is_earlier = elapsed_s < 0
+        was_silent = elapsed_s > MAX_RATE_PERIOD_S
+        has_restarted = samples > MAX_NUMBER_DIFFERENCE
+        is_new = is_earlier | was_silent | has_restarted
         is_over = ~is_new & (elapsed_s > RATE_PERIOD_S)
         self.hertz[cube[is_over]] = samples[is_over] / elapsed_s[is_over]
 
-        begins = cube[is_new | is_over]
-        self._first_ns[begins] = rows.stamp_ns[is_new | is_over]
-        self._first_sequence[begins] = rows.sequence[is_new | is_over]
+        is_first = is_new | is_over
+        begins = cube[is_first]
+        self._first_ns[begins] = rows.stamp_ns[is_first]
+        self._first_sequence[begins] = rows.sequence[is_first]

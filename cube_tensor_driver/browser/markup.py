@@ -208,7 +208,8 @@ def legend(
     if quantity is DEVIATION and field.sigma is None:
         return box(NO_DEVIATION)
     values = np.linspace(-top if quantity.signed else 0, top, LEGEND_STEPS)
-    colours = (255 * scene.colours(quantity, values, top)).astype(int).tolist()
+    fractions = scene.colours(quantity, values, top)
+    colours = (255 * fractions).astype(int).tolist()
     stops = ",".join(f"rgb({red},{green},{blue})" for red, green, blue in colours)
     middle = (LEGEND_STEPS - 1) // 2
     ticks = "".join(f"<span>{value / quantity.size:.3g}</span>" for value in values[::middle])

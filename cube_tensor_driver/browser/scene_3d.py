@@ -176,7 +176,8 @@ class Placement:
             poses: Poses of the cubes in the parent frame, in metres.
         """
         # The skin ends half a pitch outside of the centres of its outer cubes.
-        low, high = poses.position.min(axis=0), poses.position.max(axis=0)
+        low = poses.position.min(axis=0)
+        high = poses.position.max(axis=0)
         self.centre: Array = (low + high) / 2
         self.unit = float(SPAN / ((high - low).max() + poses.pitch))
         self.pitch = poses.pitch * self.unit
@@ -226,7 +227,8 @@ class Scene:
         # The points of the field are drawn at the lower faces of the cubes, so contacts are too.
         self._contact_depth = surface.depth * placement.unit + placement.poses.half_side.mean()
         points = placement.point(surface.points)
-        self._low, self._high = points.min(axis=0), points.max(axis=0)
+        self._low = points.min(axis=0)
+        self._high = points.max(axis=0)
 
         distance = np.linalg.norm(placement.poses.position, axis=1)
         self.first_cube = int(distance.argmin())
@@ -392,9 +394,11 @@ class Scene:
         poses = self._placement.poses
         arrows = lines(poses, values, length)
         # Arrows shorter than `MIN_ARROW` are left out, because they would look like dots.
-        size = np.linalg.norm(arrows[:, 1] - arrows[:, 0], axis=1)
+        vectors = arrows[:, 1] - arrows[:, 0]
+        size = np.linalg.norm(vectors, axis=1)
         arrows = arrows[size > MIN_ARROW * self._placement.arrow]
-        return scene.heads(arrows, np.broadcast_to(VIEW_DIRECTION, (len(arrows), 3)))
+        directions = np.broadcast_to(VIEW_DIRECTION, (len(arrows), 3))
+        return scene.heads(arrows, directions)
 
     def _draw_crosses(self, values: Array, longest: float) -> dict[str, Array]:
         """Return the lines of the principal stresses: a cross of three lines above each cube.
@@ -422,7 +426,8 @@ class Scene:
         placement = self._placement
         # The square of the marks is larger than the face (2 half sides); on a large skin it has a
         # minimum size.
-        side = max(2.6 * float(placement.poses.half_side[cube]), 0.2 * placement.arrow)
+        half_side = float(placement.poses.half_side[cube])
+        side = max(2.6 * half_side, 0.2 * placement.arrow)
         lines = make_corner_lines(placement.poses.rotation[cube], side)
         return np.asarray(lines + scene.above(placement.poses, 1.1)[cube])
 
@@ -431,7 +436,8 @@ class Scene:
         placement = self._placement
         rings = [np.zeros((0, 2, 3))]
         for contact in contacts:
-            radius = max(float(np.sqrt(contact.area / np.pi)) * placement.unit, MIN_RING)
+            radius_m = float(np.sqrt(contact.area / np.pi))
+            radius = max(radius_m * placement.unit, MIN_RING)
             # The ring lies in the plane of the drawn field, so that it encloses the load there.
             centre = placement.point(contact.position) - self._contact_depth * contact.normal
             rings.append(scene.ring(centre, contact.normal, radius, RING_CORNERS))
@@ -444,14 +450,16 @@ class Scene:
         z = low[2] - float(placement.poses.half_side.max())
 
         start = np.array([low[0], y, z])
-        end = start + np.array([self.bar * placement.unit, 0, 0])
+        length = self.bar * placement.unit
+        end = start + np.array([length, 0, 0])
         api.add_line_segments(
             "/bar",
             np.array([[start, end]]),
             DARK,
             thickness=0.012 * SPAN,
         )
-        middle = tuple((start + end) / 2 - np.array([0, 0.03 * SPAN, 0]))
+        below = np.array([0, 0.03 * SPAN, 0])
+        middle = tuple((start + end) / 2 - below)
         text = f"{1e3 * self.bar:g} mm"
         api.add_label(
             "/bar/label",
@@ -460,7 +468,8 @@ class Scene:
             anchor="top-center",
         )
 
-        corner, axis = np.array([high[0] - 0.05 * SPAN, y, z]), 0.1 * SPAN
+        corner = np.array([high[0] - 0.05 * SPAN, y, z])
+        axis = 0.1 * SPAN
         api.add_frame(
             "/axes",
             axes_length=axis,

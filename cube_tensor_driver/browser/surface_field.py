@@ -69,7 +69,11 @@ class FieldModel:
         prepared: Future whose result is the solver of the inverse problem; a thread prepares it.
     """
 
-    def __init__(self, surface: Surface, calibrations: Sequence[Calibration]) -> None:
+    def __init__(
+        self,
+        surface: Surface,
+        calibrations: Sequence[Calibration],
+    ) -> None:
         """Begin to prepare the solver in another thread.
 
         Args:
@@ -96,7 +100,9 @@ class FieldModel:
                 `contacts` does not publish the topic.
         """
         if cloud is not None and len(cloud):
-            pressure, shear, sigma = self._interpolate(cloud[:, :3], cloud[:, 3:]).T
+            points = cloud[:, :3]
+            interpolated = self._interpolate(points, cloud[:, 3:])
+            pressure, shear, sigma = interpolated.T
             return SurfaceField(
                 pressure,
                 shear,
@@ -110,7 +116,8 @@ class FieldModel:
             traction = inverse.field(values).traction
             # The traction is a vector in the frame of the cube below the point; z points outwards.
             x, y, z = traction.T
-            columns = np.stack([-z, np.hypot(x, y)], axis=1)
+            shear_size = np.hypot(x, y)
+            columns = np.stack([-z, shear_size], axis=1)
             pressure, shear = self._interpolate(inverse.points, columns).T
             return SurfaceField(pressure, shear, "on the surface of a thick elastomer")
         between = self._surface.field(values)
@@ -127,10 +134,14 @@ class FieldModel:
         if not np.array_equal(points, self._points):
             self._points = points
             self._nearest, self._weight = _compute_interpolation_weights(self._surface, points)
-        return np.asarray(np.einsum("pk,pkc->pc", self._weight, columns[self._nearest]))
+        nearest = columns[self._nearest]
+        return np.asarray(np.einsum("pk,pkc->pc", self._weight, nearest))
 
 
-def _make_inverse(surface: Surface, calibrations: Sequence[Calibration]) -> SurfaceInverse:
+def _make_inverse(
+    surface: Surface,
+    calibrations: Sequence[Calibration],
+) -> SurfaceInverse:
     by_pad = compute_noise_of_all_pads(calibrations)
     layer = Layer(np.inf, POISSONS_RATIO)
     return SurfaceInverse.from_poses(
@@ -141,7 +152,10 @@ def _make_inverse(surface: Surface, calibrations: Sequence[Calibration]) -> Surf
     )
 
 
-def _compute_interpolation_weights(surface: Surface, points: Array) -> tuple[Index, Array]:
+def _compute_interpolation_weights(
+    surface: Surface,
+    points: Array,
+) -> tuple[Index, Array]:
     """Return the weights of an interpolation to all N points of a surface.
 
     They are the inverse squared distances to the nearest `INTERPOLATION_POINTS` points (Shepard's
@@ -154,11 +168,16 @@ def _compute_interpolation_weights(surface: Surface, points: Array) -> tuple[Ind
     Returns:
         Indices (N, k) of the k nearest points with known values, and their weights (N, k).
     """
-    shape = len(surface.points), min(INTERPOLATION_POINTS, len(points))
+    n_nearest = min(INTERPOLATION_POINTS, len(points))
+    shape = len(surface.points), n_nearest
     # `surface.points` lie in the plane of the cubes' centres, so they are moved up to the surface
     # by the depth of the cubes.
     up = surface.depth * surface.poses.rotation[surface.cube, :, 2]
-    distance, nearest = cKDTree(points).query(surface.points + up, shape[1])
+    tree = cKDTree(points)
+    distance, nearest = tree.query(surface.points + up, n_nearest)
+    distance = distance.reshape(shape)
     # The lower limit of the distance avoids a division by zero where two points coincide.
-    weight = 1 / np.maximum(distance.reshape(shape), 1e-3 * surface.spacing) ** 2
-    return nearest.reshape(shape), weight / weight.sum(axis=1, keepdims=True)
+    min_distance = 1e-3 * surface.spacing
+    weight = 1 / np.maximum(distance, min_distance) ** 2
+    total = weight.sum(axis=1, keepdims=True)
+    return nearest.reshape(shape), weight / total

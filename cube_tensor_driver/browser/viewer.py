@@ -144,7 +144,12 @@ class Viewer:
         # What is done for each action of a user; the arguments are those of `Act`.
         self._commands: dict[str, Callable[..., None]] = {
             TARE: partial(ask, "tare", tare, Tare.Request()),
-            CLEAR_TARE: partial(ask, "undo tare", clear_tare, Trigger.Request()),
+            CLEAR_TARE: partial(
+                ask,
+                "undo tare",
+                clear_tare,
+                Trigger.Request(),
+            ),
             HOLD: self._replay.toggle_hold,
             JUMP: lambda take_position: self._replay.jump_to(take_position()),
             RECORD: self._recorder.toggle,
@@ -268,7 +273,12 @@ class Viewer:
         # Without a page, computing the field and the contacts would be useless work.
         if not self._pages:
             return
-        scan = make_scan(skin, scans, health, tuple(self._links.values()))
+        scan = make_scan(
+            skin,
+            scans,
+            health,
+            tuple(self._links.values()),
+        )
         connected = self._server.get_clients()
         for client_id, page in self._pages.items():
             if client_id in connected:

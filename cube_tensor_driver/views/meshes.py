@@ -56,7 +56,10 @@ def make_cube() -> Mesh:
     # face lists the reflected corners in reverse order.
     upper = np.column_stack([2 * _SQUARE, np.ones(4)])
     lower = -upper[::-1]
-    faces = [np.roll(face, axis, axis=1) for face in (upper, lower) for axis in range(3)]
+    faces = []
+    for face in (upper, lower):
+        for axis in range(3):
+            faces.append(np.roll(face, axis, axis=1))
     return join_squares(np.array(faces))
 
 
@@ -166,9 +169,11 @@ def colour_steps(
         top: Value at the upper end of the colour scale, in SI units.
     """
     bottom = -top if quantity.signed else 0.0
-    share = (np.nan_to_num(values) - bottom) / (top - bottom)
+    above_bottom = np.nan_to_num(values) - bottom
+    share = above_bottom / (top - bottom)
     step = np.clip(share * COLOUR_STEPS, 0, COLOUR_STEPS - 1)
-    return np.where(np.isfinite(values), step.astype(int), COLOUR_STEPS)
+    is_known = np.isfinite(values)
+    return np.where(is_known, step.astype(int), COLOUR_STEPS)
 
 
 def step_colours(quantity: Quantity) -> NDArray[np.uint8]:

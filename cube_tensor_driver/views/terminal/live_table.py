@@ -194,7 +194,11 @@ class LiveTable:
                 break
         return table
 
-    def _make_columns(self, shown: Sequence[int], pressure: Array) -> dict[str, Cells]:
+    def _make_columns(
+        self,
+        shown: Sequence[int],
+        pressure: Array,
+    ) -> dict[str, Cells]:
         """Return all columns by their headings.
 
         Args:
