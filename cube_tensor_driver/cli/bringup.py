@@ -212,7 +212,8 @@ def watch_rest(source: LinkSource) -> PadsAtRest:
             if n_samples < MIN_SAMPLES or not is_due:
                 continue
             next_shown_s = now_s + AVERAGE_S
-            frequency, seconds = (np.concatenate(each) for each in zip(*parts, strict=True))
+            columns = zip(*parts, strict=True)
+            frequency, seconds = map(np.concatenate, columns)
             rest = measure_pads_at_rest(frequency, seconds)
             table = pad_table(rest, source.skin)
             live.update(table, refresh=True)
@@ -251,7 +252,8 @@ def press_cubes(source: LinkSource, rest: PadsAtRest) -> dict[int, Explanation]:
     calibration = cubes[0].calibration
     detector = PressDetector(rest.frequency, rest.noise, rest.works)
     means = average_over_time(source, len(cubes), AVERAGE_S)
-    waiting = set(np.flatnonzero(rest.works.any(axis=1)).tolist())
+    has_working_pad = rest.works.any(axis=1)
+    waiting = set(np.flatnonzero(has_working_pad).tolist())
     expected = compute_expected_presses(calibration, list_cube_rotations())
     explanations: dict[int, Explanation] = {}
 
@@ -281,7 +283,12 @@ def press_cubes(source: LinkSource, rest: PadsAtRest) -> dict[int, Explanation]:
             presses.append(wait_for_press({cube}, f"{cubes[cube].name} on its {side} side"))
         # The pad law (docs/physics.md) converts relative changes of frequency into pad stresses.
         ratio = 1 + np.array([each.change for each in presses])
-        measured = pad_stress(ratio, 1.0, calibration.beta, calibration.modulus)
+        measured = pad_stress(
+            ratio,
+            1.0,
+            calibration.beta,
+            calibration.modulus,
+        )
         explanations[cube] = explain_presses(measured, expected)
         waiting.discard(cube)
     return explanations

@@ -217,7 +217,11 @@ def run_weight(options: argparse.Namespace) -> int:
         ):
             pairs = zip(values, deviations, strict=True)
             rows.append((pad, *(f"{value:+.3f} ± {sd:.2g}" for value, sd in pairs)))
-        print_table(("pad",), [f"{axis}, Pa per m/s²" for axis in "xyz"], rows)
+        print_table(
+            ("pad",),
+            [f"{axis}, Pa per m/s²" for axis in "xyz"],
+            rows,
+        )
     title = f"stress of the {len(calibration.gain)} pads under weight alone"
     save(draw_correction(title, *shown), options.figure)
     write_result(options.output, calibration, f"--weight {options.weight.name}")
@@ -233,7 +237,8 @@ def run_creep(options: argparse.Namespace) -> int:
 
     result, calibration = fit_recorded_creep(options.creep, options.cube)
     rows = []
-    at_once, *later = (compute_step_reading(result.model, time) for time in (1.0, 600.0, 3600.0))
+    times_s = (1.0, 600.0, 3600.0)
+    at_once, *later = (compute_step_reading(result.model, time_s) for time_s in times_s)
     for pad, load, *readings in zip(
         calibration.layout.pads,
         result.load,
@@ -243,7 +248,11 @@ def run_creep(options: argparse.Namespace) -> int:
     ):
         growth = [f"{100 * (reading / readings[0] - 1):.2f}" for reading in readings[1:]]
         rows.append((pad, f"{load:.0f}", *growth))
-    print_table(("pad",), ("load, Pa", "creep from 1 s to 10 min, %", "to 1 h, %"), rows)
+    print_table(
+        ("pad",),
+        ("load, Pa", "creep from 1 s to 10 min, %", "to 1 h, %"),
+        rows,
+    )
     say(
         f"{len(result.model.time)} relaxation times explain a hold of {result.hold_s:.0f} s to "
         f"{100 * result.misfit:.2g} % of the load"
@@ -263,7 +272,8 @@ def run_creep(options: argparse.Namespace) -> int:
 
 
 def read_inputs(
-    options: argparse.Namespace, layout: Layout
+    options: argparse.Namespace,
+    layout: Layout,
 ) -> tuple[Loads, Calibration, Array, str]:
     """Read the loads, and the base calibration with the quantities that are not fitted.
 

@@ -11,7 +11,12 @@ from .parser import Parser
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_text("node", "NODE", "as in reconstruction", nargs="?")
+    parser.add_text(
+        "node",
+        "NODE",
+        "as in reconstruction",
+        nargs="?",
+    )
     parser.add_text(
         "name",
         "NAME",

@@ -194,7 +194,12 @@ class Parser(argparse.ArgumentParser):
         added: Parser = self._subcommands.add_parser(name, help=text, description=sentence(text))
         return added
 
-    def add_words(self, metavar: str, text: str, missing: str = "") -> None:
+    def add_words(
+        self,
+        metavar: str,
+        text: str,
+        missing: str = "",
+    ) -> None:
         """Pass on all words that follow the command, including options, to another program.
 
         The parsed options have the words as the list `words`.
@@ -204,7 +209,12 @@ class Parser(argparse.ArgumentParser):
             text: Help text about the words.
             missing: Error message if no word follows; empty if none is needed.
         """
-        self.add_text("words", metavar, text, nargs=argparse.REMAINDER)
+        self.add_text(
+            "words",
+            metavar,
+            text,
+            nargs=argparse.REMAINDER,
+        )
         self.usage = f"%(prog)s {metavar} ..."
         self._passes_words, self._missing = True, missing
 
@@ -362,8 +372,16 @@ def _number_type(
 
 
 number = _number_type(float, "a finite number", math.isfinite)
-positive = _number_type(float, "a number above 0", lambda x: 0 < x < math.inf)
-not_negative = _number_type(float, "a number of at least 0", lambda x: 0 <= x < math.inf)
+positive = _number_type(
+    float,
+    "a number above 0",
+    lambda x: 0 < x < math.inf,
+)
+not_negative = _number_type(
+    float,
+    "a number of at least 0",
+    lambda x: 0 <= x < math.inf,
+)
 sample_rate = _number_type(
     float,
     "a rate from 0.1 to 10000 samples per second",

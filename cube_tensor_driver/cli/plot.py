@@ -46,7 +46,12 @@ def run(options: argparse.Namespace) -> int:
     from ..views.figures.time_series import draw_series, read_cube_series
 
     with open_bag(options.bag) as source:
-        series = read_cube_series(source, options.cube, options.start, options.end)
+        series = read_cube_series(
+            source,
+            options.cube,
+            options.start,
+            options.end,
+        )
     save(draw_series(series, options.bag.resolve().name), options.output)
     print(f"wrote {options.output}: cube {series.name}, {len(series.seconds)} samples")
     return 0

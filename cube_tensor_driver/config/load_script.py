@@ -241,7 +241,10 @@ def interpolate_knots(knots: Array, when: float | Array) -> Array:
 
 
 def _make_indenter(item: dict[str, Any]) -> Indenter:
-    actions = [_make_action(kind, keys) for does in item["does"] for kind, keys in does.items()]
+    actions = []
+    for does in item["does"]:
+        for kind, keys in does.items():
+            actions.append(_make_action(kind, keys))
     # In the file the actions of an indenter may stand in any order.
     actions.sort(key=lambda action: action.start)
     return Indenter(
@@ -254,17 +257,20 @@ def _make_indenter(item: dict[str, Any]) -> Indenter:
 
 
 def _make_action(kind: str, item: dict[str, Any]) -> Action:
-    path = np.array(item["path"] if "path" in item else [item["at"]], float)
+    places = item["path"] if "path" in item else [item["at"]]
+    path = np.array(places, float)
     force = np.array(item["force"], float)
     if kind == "tap":
         peak = float(item["force"])
         # Each tap rises from 0 to the peak and falls to 0.
-        force = np.array([0.0, *[peak, 0.0] * item.get("times", 1)])
+        n_taps = item.get("times", 1)
+        force = np.array([0.0, *[peak, 0.0] * n_taps])
     elif force.ndim == 0:
         # A single value is the maximum: the force rises from 0 to it in the first third of the
         # action and falls to 0 in the last third.
         force = np.array([0.0, force, force, 0.0])
-    shear = np.atleast_2d(np.array(item.get("shear", [0.0, 0.0, 0.0]), float))
+    shear_knots = item.get("shear", [0.0, 0.0, 0.0])
+    shear = np.atleast_2d(np.array(shear_knots, float))
     return Action(
         kind,
         float(item["from"]),
@@ -328,7 +334,8 @@ def _find_max_shear_ratio(action: Action) -> float:
     # The first and last instants are left out, because both forces may be 0 there.
     when = np.linspace(0, 1, FRICTION_SAMPLES)[1:-1]
     force = interpolate_knots(action.force, when)
-    shear = np.linalg.norm(interpolate_knots(action.shear, when), axis=-1)
+    shear_forces = interpolate_knots(action.shear, when)
+    shear = np.linalg.norm(shear_forces, axis=-1)
     without_force = np.where(shear > 0, np.inf, 0.0)
     # A tangential force without a normal force makes the indenter slip: its ratio is infinite.
     ratio = np.divide(

@@ -46,7 +46,8 @@ def find_pose_doubts(skin: Skin) -> Iterator[str]:
     positions = np.array([cube.xyz for cube in skin.cubes])
     yield from _find_shared_positions(skin, positions)
     if _seems_in_millimetres(positions):
-        most_distant = int(np.abs(positions).max(axis=1).argmax())
+        largest_coordinate = np.abs(positions).max(axis=1)
+        most_distant = int(largest_coordinate.argmax())
         cube = skin.cubes[most_distant]
         yield (
             f"cubes: {cube.name!r} is at [{_format(cube.xyz)}] m, where no skin reaches: "
@@ -83,7 +84,8 @@ def _seems_in_millimetres(positions: Array) -> bool:
     # the distances of neighbouring cubes are too large.
     if not MIN_SPACED_CUBES <= len(positions) <= MAX_SPACED_CUBES:
         return False
-    distance = np.linalg.norm(positions[:, np.newaxis] - positions, axis=2)
+    offsets = positions[:, np.newaxis] - positions
+    distance = np.linalg.norm(offsets, axis=2)
     # The distance of a cube from itself, 0, must not count as the smallest one.
     np.fill_diagonal(distance, np.inf)
     return bool(distance.min() > MAX_SPACING_M)

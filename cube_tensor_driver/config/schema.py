@@ -179,7 +179,8 @@ def _describe(error: jsonschema.ValidationError) -> str:
         unknown = ", ".join(repr(name) for name in error.instance if name not in allowed)
         return f"{key}: unknown key {unknown}, allowed: {', '.join(allowed)}"
     if error.validator == "required":
-        missing = ", ".join(repr(name) for name in schema["required"] if name not in error.instance)
+        required = schema["required"]
+        missing = ", ".join(repr(name) for name in required if name not in error.instance)
         return f"{key}: the key {missing} is missing"
 
     found = repr(error.instance)

@@ -265,7 +265,10 @@ def check_skin(path: Path) -> tuple[Skin | None, list[str]]:
     return check_skin_data(read_yaml(path), path.parent)
 
 
-def check_skin_data(data: object, folder: Path) -> tuple[Skin | None, list[str]]:
+def check_skin_data(
+    data: object,
+    folder: Path,
+) -> tuple[Skin | None, list[str]]:
     """Check the content of a skin file.
 
     Args:
@@ -433,7 +436,11 @@ def _find_link_mistakes(links: tuple[SkinLink, ...]) -> Iterator[str]:
         problem = find_port_problem(link.port)
         if problem:
             yield f"links: port of {link.name}: {problem}"
-    yield from _find_repeated("links", "name", [repr(link.name) for link in links])
+    yield from _find_repeated(
+        "links",
+        "name",
+        [repr(link.name) for link in links],
+    )
     # The labels on hubs show the uid in hexadecimal, so the error message does, too.
     hub_uids = [hex(link.hub_uid) for link in links if link.hub_uid is not None]
     yield from _find_repeated("links", "hub_uid", hub_uids)
@@ -444,7 +451,11 @@ def _find_link_mistakes(links: tuple[SkinLink, ...]) -> Iterator[str]:
 
 
 def _find_cube_mistakes(cubes: tuple[SkinCube, ...]) -> Iterator[str]:
-    yield from _find_repeated("cubes", "name", [repr(cube.name) for cube in cubes])
+    yield from _find_repeated(
+        "cubes",
+        "name",
+        [repr(cube.name) for cube in cubes],
+    )
     uids = [hex(cube.uid) for cube in cubes if cube.uid is not None]
     yield from _find_repeated("cubes", "uid", uids)
     addresses = [f"{cube.link!r}, {cube.index}" for cube in cubes if cube.index is not None]
@@ -470,7 +481,11 @@ def _find_pad_mistakes(
             )
 
 
-def _find_repeated(where: str, what: str, values: list[str]) -> Iterator[str]:
+def _find_repeated(
+    where: str,
+    what: str,
+    values: list[str],
+) -> Iterator[str]:
     for value, count in Counter(values).items():
         if count > 1:
             times = "twice" if count == 2 else f"{count} times"

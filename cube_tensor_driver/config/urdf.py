@@ -25,7 +25,11 @@ def make_skin_urdf(skin: Skin) -> str:
     SubElement(robot, "link", name=skin.parent_frame)
     # A robot may carry several skins, and names of materials must differ within one URDF.
     material = f"{skin.name}_cube"
-    SubElement(SubElement(robot, "material", name=material), "color", rgba=CUBE_COLOUR)
+    SubElement(
+        SubElement(robot, "material", name=material),
+        "color",
+        rgba=CUBE_COLOUR,
+    )
     for cube in skin.cubes:
         _add_cube(
             robot,

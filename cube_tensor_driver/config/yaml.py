@@ -44,7 +44,11 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
     lines of a skin file would then lose its first value unnoticed.
     """
 
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+    def construct_mapping(
+        self,
+        node: yaml.MappingNode,
+        deep: bool = False,
+    ) -> dict[Any, Any]:
         # A mapping may override keys that "<<" copies from another mapping. Therefore its own keys
         # are listed now, before PyYAML inserts the copied ones into the node.
         own_keys = [key for key, _ in node.value if key.tag != _MERGE_TAG]
