@@ -169,7 +169,15 @@ class Calibration:
             self._set("coefficients", ordered)
         else:
             shape = (self.layout.n_pads, structure.modes.n_modes)
-            self._set("matrix", read_numbers(self.matrix, "matrix", CalibrationError, shape))
+            self._set(
+                "matrix",
+                read_numbers(
+                    self.matrix,
+                    "matrix",
+                    CalibrationError,
+                    shape,
+                ),
+            )
         if self.covariance is not None:
             square = (structure.n_coefficients, structure.n_coefficients)
             covariance = read_numbers(
@@ -395,7 +403,10 @@ def illustrative(
     )
 
 
-def _check_keys(data: Mapping[str, Any], attributes: set[str]) -> None:
+def _check_keys(
+    data: Mapping[str, Any],
+    attributes: set[str],
+) -> None:
     """Raise CalibrationError if keys are missing or unknown, or the schema is not `SCHEMA`.
 
     Args:

@@ -268,11 +268,13 @@ def _orthonormalise(
         chosen = remainder[:, longest]
         # The part along earlier results was already subtracted. What rounding errors left of it is
         # subtracted here.
-        overlap = (result[:length] * chosen[:length, None]).sum(axis=0)
+        products = result[:length] * chosen[:length, None]
+        overlap = products.sum(axis=0)
         chosen = chosen - (result * overlap).sum(axis=1)
         square = (chosen[:length] ** 2).sum()
         chosen = chosen / np.sqrt(square)
-        overlap = (remainder[:length] * chosen[:length, None]).sum(axis=0)
+        products = remainder[:length] * chosen[:length, None]
+        overlap = products.sum(axis=0)
         remainder = remainder - chosen[:, None] * overlap
         result = np.column_stack([result, chosen])
     return result
@@ -375,7 +377,8 @@ def chi2_tail(x: float, dof: int) -> float:
     while a < dof / 2:
         # The product h^a exp(-h) / Gamma(a + 1) is computed by logarithms, because h^a alone
         # overflows for many degrees of freedom.
-        tail += math.exp(a * math.log(h) - h - math.lgamma(a + 1))
+        log_term = a * math.log(h) - h - math.lgamma(a + 1)
+        tail += math.exp(log_term)
         a += 1
     return tail
 

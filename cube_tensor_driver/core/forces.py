@@ -55,7 +55,12 @@ class Forces:
         check_skin(skin, "poses")
         if side is not None:
             allowed = "a number above 0, in m, or None"
-            check_number("side", side, lambda x: 0 < x < math.inf, allowed)
+            check_number(
+                "side",
+                side,
+                lambda x: 0 < x < math.inf,
+                allowed,
+            )
         self.position, self._rotation, half_side = skin.poses
         self.side = 2 * half_side
         if side is not None:

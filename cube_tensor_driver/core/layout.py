@@ -216,7 +216,8 @@ def _name_axes(vector: Array) -> str:
 def _parse_axis(text: str) -> Array:
     """Return the unit vector of a direction such as "+z"."""
     sign = 1.0 if text[0] == "+" else -1.0
-    unit: Array = sign * np.eye(3)[AXES.index(text[1])]
+    axis = AXES.index(text[1])
+    unit: Array = sign * np.eye(3)[axis]
     return unit
 
 

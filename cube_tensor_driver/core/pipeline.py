@@ -132,7 +132,11 @@ class Pipeline:
 
     rest_changes = -1  # the calibrated rest frequencies, which are set first, are no change
 
-    def __init__(self, calibrations: Sequence[Calibration], dtype: type = np.float64) -> None:
+    def __init__(
+        self,
+        calibrations: Sequence[Calibration],
+        dtype: type = np.float64,
+    ) -> None:
         """Prepare the matrices of all calibrations.
 
         Args:
@@ -352,7 +356,11 @@ class Pipeline:
             left_out=np.empty(n, np.uint32),
         )
 
-    def pad_stress(self, rows: FrequencyRows, left_out: PadMasks | None = None) -> Array:
+    def pad_stress(
+        self,
+        rows: FrequencyRows,
+        left_out: PadMasks | None = None,
+    ) -> Array:
         """Compute pad stresses (N, P), in Pa, by the pad law.
 
         They are not divided by the gains (relative sensitivities) of the pads. They are NaN for
@@ -366,7 +374,11 @@ class Pipeline:
         _, is_used, stress = self._apply_law(rows, left_out)
         return np.where(is_used, stress, np.nan)
 
-    def suspects(self, rows: FrequencyRows, left_out: PadMasks | None = None) -> Mask:
+    def suspects(
+        self,
+        rows: FrequencyRows,
+        left_out: PadMasks | None = None,
+    ) -> Mask:
         """Find each pad that, as the only broken pad of a cube, would explain a high residual.
 
         Args:
@@ -460,7 +472,9 @@ class Pipeline:
         )
 
     def _apply_law(
-        self, rows: FrequencyRows, left_out: PadMasks | None
+        self,
+        rows: FrequencyRows,
+        left_out: PadMasks | None,
     ) -> tuple[Numbers, Mask, Array]:
         """Apply the pad law (frequency to stress of a pad) to N rows.
 

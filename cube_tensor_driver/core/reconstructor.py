@@ -166,7 +166,11 @@ class Reconstructor:
 
     __call__ = process
 
-    def process_known(self, rows: FrequencyRows, recorded: RecordedHealth) -> StressRows:
+    def process_known(
+        self,
+        rows: FrequencyRows,
+        recorded: RecordedHealth,
+    ) -> StressRows:
         """Reconstruct the stress of rows from a recording that states the health of their pads.
 
         The pads are not examined again, which saves time.

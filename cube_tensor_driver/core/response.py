@@ -140,7 +140,10 @@ def response(structure: Structure, coefficients: Mapping[str, float]) -> Array:
     return np.tensordot(values, structure.basis, axes=1)
 
 
-def project(structure: Structure, matrix: Array) -> tuple[dict[str, float], float]:
+def project(
+    structure: Structure,
+    matrix: Array,
+) -> tuple[dict[str, float], float]:
     """Find the symmetric response matrix that is nearest to a given one.
 
     Each coefficient is the mean of the entries that the symmetry makes equal, up to their signs.

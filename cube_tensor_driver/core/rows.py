@@ -59,7 +59,9 @@ class _Rows:
         Args:
             chosen: Row numbers, a slice or a mask (N,), with which numpy indexes an array.
         """
-        return type(self)(**{name: column[chosen] for name, column in self.columns().items()})
+        columns = self.columns()
+        selected = {name: column[chosen] for name, column in columns.items()}
+        return type(self)(**selected)
 
     def columns(self) -> dict[str, AnyArray]:
         """Return the columns that the table has, by name."""
@@ -214,9 +216,10 @@ def concatenate(parts: Sequence[_Kind]) -> _Kind:
     """
     columns = [part.columns() for part in parts]
     common = [name for name in columns[0] if all(name in column for column in columns)]
-    return type(parts[0])(
-        **{name: np.concatenate([column[name] for column in columns]) for name in common}
-    )
+    joined = {}
+    for name in common:
+        joined[name] = np.concatenate([column[name] for column in columns])
+    return type(parts[0])(**joined)
 
 
 def _fill_columns(cube: ArrayLike, **columns: Any) -> dict[str, AnyArray]:

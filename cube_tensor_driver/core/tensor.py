@@ -59,8 +59,11 @@ def invariants(stress: Real) -> Array:
     """
     xx, yy, zz, yz, zx, xy = _split(stress)
     trace = xx + yy + zz
-    minors = xx * yy + yy * zz + zz * xx - yz**2 - zx**2 - xy**2
-    determinant = xx * yy * zz + 2 * yz * zx * xy - xx * yz**2 - yy * zx**2 - zz * xy**2
+    normal_products = xx * yy + yy * zz + zz * xx
+    minors = normal_products - yz**2 - zx**2 - xy**2
+    # The rule of Sarrus adds the products along one diagonal and subtracts those along the other.
+    added_products = xx * yy * zz + 2 * yz * zx * xy
+    determinant = added_products - xx * yz**2 - yy * zx**2 - zz * xy**2
     return np.stack([trace, minors, determinant], axis=-1)
 
 

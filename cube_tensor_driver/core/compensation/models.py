@@ -84,7 +84,8 @@ class EffectModel:
             CalibrationError: A key is missing or unknown, or a value is invalid.
         """
         required = {item.name for item in fields(cls) if item.default is MISSING}
-        if not isinstance(data, Mapping) or not required <= set(data) <= set(cls.axes):
+        allowed = set(cls.axes)
+        if not isinstance(data, Mapping) or not required <= set(data) <= allowed:
             raise CalibrationError(
                 f"{cls.key}: found {data!r}; it is a table of {', '.join(cls.axes)}"
             )

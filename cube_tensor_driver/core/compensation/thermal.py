@@ -66,7 +66,8 @@ class Thermal:
         present = [model for model in self._models if model is not None]
         n_lags = max((len(model.lag) for model in present), default=0)
         n_degrees = max((model.coefficient.shape[1] for model in present), default=0)
-        stiffness = np.where(pipeline.stiffness > 0, pipeline.stiffness, np.inf).T
+        has_stiffness = pipeline.stiffness > 0
+        stiffness = np.where(has_stiffness, pipeline.stiffness, np.inf).T
         n = len(self._models)
         times = np.full((n_lags, n), MIN_LAG_S)
         self._reference = np.zeros(n)

@@ -88,7 +88,9 @@ class DriftTracker:
         self._followed_windows = np.zeros(n_cubes, int)
         self._loaded_windows = np.zeros(n_cubes, int)
         names = np.array([calibration.layout.name for calibration in pipeline.calibrations])
-        self._layouts = [np.flatnonzero(names == name) for name in np.unique(names)]
+        self._layouts = []
+        for name in np.unique(names):
+            self._layouts.append(np.flatnonzero(names == name))
         self.deviation = np.zeros(n_cubes)
 
     def step(self, time_constant: float) -> None:

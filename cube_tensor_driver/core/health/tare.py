@@ -176,9 +176,11 @@ def _select_windows(
     if present.rows.any():
         windows.append(present)
 
-    averaged = Window(*(np.array(values)[:, chosen] for values in zip(*windows, strict=True)))
+    columns = [np.array(values) for values in zip(*windows, strict=True)]
+    averaged = Window(*(column[:, chosen] for column in columns))
     has_empty_window = (averaged.rows[:count] == 0).any(axis=0)
-    has_too_few = has_empty_window | (averaged.rows.sum(axis=0) < MIN_ROWS)
+    n_rows = averaged.rows.sum(axis=0)
+    has_too_few = has_empty_window | (n_rows < MIN_ROWS)
     for cube in chosen[has_too_few].tolist():
         raise TareError(
             f"cube {names[cube]}: no data, or gaps in it, in the last {duration:g} s; see its link"
@@ -207,7 +209,8 @@ def _refuse_gaps(
     age_ns = health.newest_ns - health.sums.cubes["time_ns"][chosen]
     gaps_ns = [*before, *windows.gap_within, age_ns]
     gaps_s = 1e-9 * np.abs(gaps_ns)
-    mean_interval_s = len(windows.rows) * WINDOW_S / windows.rows.sum(axis=0)
+    duration_s = len(windows.rows) * WINDOW_S
+    mean_interval_s = duration_s / windows.rows.sum(axis=0)
     limit_s = np.maximum(MAX_GAP_S, MAX_GAP_ROWS * mean_interval_s)
     longest_s = gaps_s.max(axis=0)
     for number in np.flatnonzero(longest_s > limit_s).tolist():
@@ -231,9 +234,11 @@ def _average(windows: Window) -> _Means:
     known_variance = np.nan_to_num(variance)
     total_variance = (known_variance * rows_with_noise).sum(axis=0)
     n_with_noise = np.maximum(rows_with_noise.sum(axis=0), 1)
+    highest = np.fmax.reduce(windows.highest)
+    lowest = np.fmin.reduce(windows.lowest)
     return _Means(
         frequency=total / rows.sum(axis=0),
-        span=np.fmax.reduce(windows.highest) - np.fmin.reduce(windows.lowest),
+        span=highest - lowest,
         noise=np.sqrt(total_variance / n_with_noise),
     )
 
