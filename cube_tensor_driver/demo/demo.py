@@ -181,7 +181,8 @@ def write_grid(
     # Surplus cubes of the last row are removed, and with them links (hubs) without any cube.
     skin["cubes"] = skin["cubes"][:cubes]
     used = {cube["link"] for cube in skin["cubes"]}
-    skin["links"] = [link for link in skin["links"] if link["name"] in used]
+    all_links = skin["links"]
+    skin["links"] = [link for link in all_links if link["name"] in used]
     write_yaml(path, skin)
     return path
 

@@ -86,8 +86,9 @@ class ForceHistory:
         distance = np.linalg.norm(along_skin, axis=1)
 
         peak = np.abs(self.force).max(axis=0)
-        squares = (self.measured_force - self.force) ** 2
-        error = np.sqrt(squares.mean(axis=0))
+        force_error = self.measured_force - self.force
+        mean_square = (force_error**2).mean(axis=0)
+        error = np.sqrt(mean_square)
         return {
             "force_peak_n": peak.round(2).tolist(),
             "force_error_n": error.round(2).tolist(),
@@ -233,14 +234,17 @@ class LoadVerification:
             NaN where no tensor arrived; whether a tensor of every cube arrived (T,).
         """
         sampled_ns = np.unique(comparison.taken_ns)
-        times_ns = sampled_ns[:: max(1, len(sampled_ns) // MIN_TIMES_COMPARED)]
+        step = max(1, len(sampled_ns) // MIN_TIMES_COMPARED)
+        times_ns = sampled_ns[::step]
         is_chosen = np.isin(comparison.taken_ns, times_ns)
         time = np.searchsorted(times_ns, comparison.taken_ns[is_chosen])
         rows = comparison.first[is_chosen]
         cube = self._stress.columns()[0][rows]
-        values = np.full((len(times_ns), self._n_cubes, len(COMPONENTS)), np.nan)
+        shape = (len(times_ns), self._n_cubes, len(COMPONENTS))
+        values = np.full(shape, np.nan)
         if len(rows):
-            values[time, cube] = np.concatenate(self._components)[rows]
+            components = np.concatenate(self._components)
+            values[time, cube] = components[rows]
         n_arrived = np.bincount(time, minlength=len(times_ns))
         return times_ns, values, n_arrived == self._n_cubes
 
@@ -263,9 +267,9 @@ class LoadVerification:
         times_ns, values, _ = self._find_received(comparison)
         if not len(times_ns):
             return dict.fromkeys(("error_rel_rms", "error_rel_worst", "error_over_noise"), np.nan)
-        error = values - np.array(
-            [self._compute_truth(time) for time in self._compute_seconds(times_ns)]
-        )
+        seconds = self._compute_seconds(times_ns)
+        truth = [self._compute_truth(time) for time in seconds]
+        error = values - np.array(truth)
 
         times = np.linspace(0, self.load.period, RANGE_TIMES)
         script = [self._compute_truth(time) for time in times]
@@ -306,5 +310,8 @@ def component_noise(skin: Skin) -> Array:
         Standard deviations (cubes, 15) in Pa and Pa/m; NaN where a component is not observed.
     """
     pipeline = Pipeline(skin.calibrations)
-    variances = [np.diag(pipeline.covariance(cube)) for cube in range(len(skin.cubes))]
+    variances = []
+    for cube in range(len(skin.cubes)):
+        covariance = pipeline.covariance(cube)
+        variances.append(np.diag(covariance))
     return np.sqrt(np.array(variances))

@@ -36,9 +36,11 @@ class Usage:
         """Return the processor time of each process since this object was made, divided by the
         elapsed time, in percent of one core."""
         elapsed_s = time.monotonic() - self._start_s
-        before_s = self._start_cpu_s
-        now_s = self._sum_cpu_seconds()
-        return {name: 100 * (now_s[name] - before_s[name]) / elapsed_s for name in now_s}
+        percent = {}
+        for name, now_s in self._sum_cpu_seconds().items():
+            used_s = now_s - self._start_cpu_s[name]
+            percent[name] = 100 * used_s / elapsed_s
+        return percent
 
     def memory_mb(self) -> dict[str, float]:
         """Return the resident memory of each process, in MiB."""
@@ -52,6 +54,9 @@ class Usage:
         return {name: process.num_threads() for name, process in self._processes.items()}
 
     def _sum_cpu_seconds(self) -> dict[str, float]:
-        # System time counts as well, because messages are sent and received in the kernel.
-        times = {name: process.cpu_times() for name, process in self._processes.items()}
-        return {name: time.user + time.system for name, time in times.items()}
+        seconds = {}
+        for name, process in self._processes.items():
+            times = process.cpu_times()
+            # System time counts as well, because messages are sent and received in the kernel.
+            seconds[name] = times.user + times.system
+        return seconds

@@ -72,8 +72,9 @@ class Arrivals:
         # The columns are copied, because the rows may be views of a message whose memory is reused
         # for the next message.
         received = np.full(len(rows), received_ns)
-        columns = np.array([rows.cube, rows.sequence, rows.stamp_ns, received], np.int64)
-        self._parts.append(columns[:, kept])
+        columns = [rows.cube, rows.sequence, rows.stamp_ns, received]
+        table = np.array(columns, np.int64)
+        self._parts.append(table[:, kept])
 
     def columns(self) -> Index:
         """Return four columns (4, N) of the stored rows, in the order of their arrival.

@@ -223,7 +223,12 @@ class SkinWatcher:
         self._made_s = time.monotonic()
         self._crc_errors: dict[str, int] = {}
         profile = batch_profile(rate)
-        observer.listen(SkinStress, "stress", self._on_stress, profile)
+        observer.listen(
+            SkinStress,
+            "stress",
+            self._on_stress,
+            profile,
+        )
         if verification is not None:
             observer.listen(
                 SkinFrequencies,

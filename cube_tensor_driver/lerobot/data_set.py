@@ -224,7 +224,9 @@ class DataSet:
                 "features": self._describe_features(),
             },
         )
-        statistics = {key: _as_lists(one, self.frames) for key, one in self._statistics.items()}
+        statistics = {}
+        for key, one in self._statistics.items():
+            statistics[key] = _as_lists(one, self.frames)
         _write_json(meta / "stats.json", statistics)
 
     def _place(self) -> dict[str, int]:
@@ -274,7 +276,8 @@ def _as_column(values: AnyArray | list[bytes]) -> pyarrow.Array:
         # LeRobot reads an image from the bytes if it has no path to an image file.
         return pyarrow.array([{"bytes": image, "path": None} for image in values], _IMAGE)
     # LeRobot stores a feature of one number as this number, and not as a list of it.
-    return as_column(values[:, 0] if values.shape[1:] == (1,) else values)
+    is_one_number = values.shape[1:] == (1,)
+    return as_column(values[:, 0] if is_one_number else values)
 
 
 def describe_skin(skin: Skin) -> dict[str, Any]:

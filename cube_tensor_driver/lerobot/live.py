@@ -322,7 +322,9 @@ def nearest_cubes(skin: Skin, width: int, height: int) -> AnyArray:
     across, up = offset[:, kept].T
     top = NUMBER_GRID[0] * MIN_SQUARE
     free = height - top
-    extent = max(np.ptp(across) / width, np.ptp(up) / free)
+    horizontal_extent = np.ptp(across) / width
+    vertical_extent = np.ptp(up) / free
+    extent = max(horizontal_extent, vertical_extent)
     # The centres of the cubes fill 1/1.2 of the picture. With this margin, the cubes at the edges
     # appear about as large as the others.
     pixel = 1.2 * extent if extent > 0 else 1.0

@@ -401,11 +401,11 @@ def _find_marked_spans(
             f"{bag.path}: no marks ({MARK_TYPE}) on {topic}; topics of that type: {names}"
         )
     marks = [(time_ns, mark.data.strip()) for time_ns, mark in bag.decoded({topic})]
-    spans = [
-        (since_ns, until_ns, task)
-        for (since_ns, task), (until_ns, _) in pairwise([*marks, (MAX_TIME_NS, "")])
-        if task
-    ]
+    end = (MAX_TIME_NS, "")
+    spans = []
+    for (since_ns, task), (until_ns, _) in pairwise([*marks, end]):
+        if task:
+            spans.append((since_ns, until_ns, task))
     if not spans:
         raise BagError(f"{bag.path}: no mark on {topic} begins an episode; publish its task there")
     return spans
