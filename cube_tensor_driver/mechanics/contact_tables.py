@@ -237,7 +237,12 @@ class DiscTables(_ContactTables):
         n_distances = _LAST_DISTANCE + 2
         first_row = self._find_nearest_size(radius) * n_distances + below
         rows = first_row[..., None] + np.array([0, 1])
-        return self._sum_loads(weights, rows, loads.astype(complex), direction)
+        return self._sum_loads(
+            weights,
+            rows,
+            loads.astype(complex),
+            direction,
+        )
 
     def _find_nearest_size(self, radius: ArrayLike) -> Index:
         """Return the index (L,) in `CONTACT_SIZES` of the tabulated radius nearest to each radius.
@@ -292,7 +297,8 @@ class PolygonTables(_ContactTables):
         # variable eta, with t = sqrt(1 + d^2) sinh(eta).
         t_slope = t_scale * np.cosh(eta)
         alpha_slope = d * t_slope / r_safe**2
-        exponents = ORDERS + np.array([-1, 1, 0, 0])[:, None]
+        added_orders = np.array([-1, 1, 0, 0])
+        exponents = ORDERS + added_orders[:, None]
         phases = direction[..., None, None] ** exponents
         reached = np.minimum(r, REACH_DEPTHS)
         integrand = over_distance(reached) * phases

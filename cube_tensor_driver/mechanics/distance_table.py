@@ -133,7 +133,10 @@ class DistanceTable:
         return np.asarray(sum(terms))
 
 
-def cubic_weights(index: Array | float, count: int = 1) -> tuple[Array, ...]:
+def cubic_weights(
+    index: Array | float,
+    count: int = 1,
+) -> tuple[Array, ...]:
     """Return the weights of cubic Lagrange interpolation from four neighbouring table entries.
 
     Args:

@@ -155,7 +155,12 @@ class Spectra:
         sign = (-1.0) ** other.order
         of_conjugate = normal + half * same
         of_direct = sign * (normal - half * crossed)
-        conjugate = self._integrate(of_conjugate, order - other.order, bessel, prior)
+        conjugate = self._integrate(
+            of_conjugate,
+            order - other.order,
+            bessel,
+            prior,
+        )
         direct = self._integrate(of_direct, order + other.order, bessel, prior)
 
         # The covariances of real and imaginary parts follow from those of the complex components:

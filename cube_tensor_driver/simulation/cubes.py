@@ -142,7 +142,12 @@ class SimulatedCubes:
             pad_stress = self._behaviour.reported(pad_stress, seconds)
 
         rest, beta, modulus = self._law
-        hertz = pad_frequency(pad_stress, rest * drifted * warm, beta, modulus)
+        hertz = pad_frequency(
+            pad_stress,
+            rest * drifted * warm,
+            beta,
+            modulus,
+        )
         if self._is_noisy:
             hertz *= 1 + self._noise * self._random.standard_normal(hertz.shape)
         # The frequency is NaN if the stress is outside the range of the pad law.

@@ -83,7 +83,8 @@ class HeavyPads:
         """Return position (3,), in m, and rotation (3, 3) of the parent frame at a time in s."""
         number = np.interp(seconds, self._times, self._numbers)
         begin = np.floor(number)
-        eased = begin + 0.5 * (1 - np.cos(np.pi * (number - begin)))
+        phase = np.pi * (number - begin)
+        eased = begin + 0.5 * (1 - np.cos(phase))
         values = [np.interp(eased, self._numbers, column) for column in self._columns]
         return np.array(values[:3]), rotation_from_rpy(*values[3:])
 
@@ -91,7 +92,10 @@ class HeavyPads:
         """Return the specific force at each cube in its own frame (cubes, 3), in m/s²."""
         times = seconds - STEP_S, seconds, seconds + STEP_S
         poses = [self._compute_pose(time) for time in times]
-        before, now, after = (p + self._cubes.position @ rotation.T for p, rotation in poses)
+        positions = []
+        for origin, rotation in poses:
+            positions.append(origin + self._cubes.position @ rotation.T)
+        before, now, after = positions
         in_world = (after - 2 * now + before) / STEP_S**2
         in_world[:, 2] += STANDARD_GRAVITY
         _, rotation = poses[1]

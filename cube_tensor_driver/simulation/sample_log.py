@@ -173,14 +173,17 @@ class SampleLog:
             link_of_cube[link.members] = index
             for run in link.runs:
                 count = np.arange(len(run))
+                link_index = np.full(len(run), index)
+                number = run.first + count
                 time_us = run.start_us + run.period_us * count
-                parts.append(np.array([np.full(len(run), index), run.first + count, time_us]))
+                parts.append(np.array([link_index, number, time_us]))
         links, numbers, times_us = np.hstack(parts)
+        rows_per_sample = [len(link.members) for link in self.links]
         return SampleTable(
             link=links,
             number=numbers,
             time_ns=self.start_time_ns + 1000 * times_us,
-            rows_per_sample=np.array([len(link.members) for link in self.links], int),
+            rows_per_sample=np.array(rows_per_sample, int),
             link_of_cube=link_of_cube,
         )
 
@@ -228,8 +231,16 @@ class SampleTable:
             among = np.arange(len(self))
         # A sample contains all cubes of a hub, so it is identified by the link instead of the cube.
         number = self.number[among] % COUNTER_RANGE
-        known = SampleKeys(self.link[among], number, self.time_ns[among])
-        wanted = SampleKeys(self.link_of_cube[rows.cube], rows.sequence, rows.stamp_ns)
+        known = SampleKeys(
+            self.link[among],
+            number,
+            self.time_ns[among],
+        )
+        wanted = SampleKeys(
+            self.link_of_cube[rows.cube],
+            rows.sequence,
+            rows.stamp_ns,
+        )
         found = match_rows(known, wanted)
         # A row without a match has the index `NO_MATCH`, which is -1 and selects the last element.
         return np.append(among, NO_MATCH)[found]

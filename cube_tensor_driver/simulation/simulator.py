@@ -234,7 +234,11 @@ class Simulator:
             )
             for link in self._links
         )
-        return SampleLog(self.start_time_ns, links, tuple(self._injector.records))
+        return SampleLog(
+            self.start_time_ns,
+            links,
+            tuple(self._injector.records),
+        )
 
     def close(self) -> None:
         """Remove the ports, the pipe for faults, and the folder if it is empty then."""

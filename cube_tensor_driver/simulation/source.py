@@ -79,7 +79,12 @@ def simulate(
         lambda x: 0 <= x < math.inf,
         "a number of at least 0",
     )
-    check_number("drift", drift, math.isfinite, "a finite number")
+    check_number(
+        "drift",
+        drift,
+        math.isfinite,
+        "a finite number",
+    )
 
     # The cubes are created again in each iteration. Creating them here, too, raises errors of the
     # skin before the first iteration.

@@ -217,7 +217,9 @@ class ThermalPads:
     def _outside(self, seconds: float) -> tuple[float, float]:
         """Return the temperatures of ground and air at a time in s, in °C."""
         ground, air = self._knots
-        return float(np.interp(seconds, *ground)), float(np.interp(seconds, *air))
+        ground_temperature = np.interp(seconds, *ground)
+        air_temperature = np.interp(seconds, *air)
+        return float(ground_temperature), float(air_temperature)
 
     def measured(self, seconds: float) -> float:
         """Return what the hub's thermometer measures, the temperature of the ground, in °C."""

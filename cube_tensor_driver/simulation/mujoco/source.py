@@ -254,7 +254,11 @@ class MujocoSkin:
         # MuJoCo's normal points from the first body to the second one.
         sign = 2 * side - 1
         place, force, outward = self._find_contact_points(part, rows, sign)
-        normal = surface_normal(part.poses, part.pitch, place.mean(axis=0))
+        normal = surface_normal(
+            part.poses,
+            part.pitch,
+            place.mean(axis=0),
+        )
         is_felt = (outward @ normal > 0) & (force @ normal < 0)
         if not is_felt.any():
             return None
