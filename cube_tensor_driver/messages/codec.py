@@ -263,7 +263,11 @@ class MessageCodec(Generic[AnyRows]):
         frame_id = record["frame_id"][0].tobytes()
         return Decoded(rows, stamp_ns, frame_id)
 
-    def decode_columns(self, names: Sequence[str], messages: bytes | AnyArray) -> list[AnyArray]:
+    def decode_columns(
+        self,
+        names: Sequence[str],
+        messages: bytes | AnyArray,
+    ) -> list[AnyArray]:
         """Decode only some columns of the rows, without copying the others.
 
         Args:
@@ -412,7 +416,8 @@ class MessageCodec(Generic[AnyRows]):
             MessageError: The message is too short, is not little-endian CDR, or has another length
                 than follows from these numbers.
         """
-        if len(data) < _FRAME_AT + 4 or data[:2] != LITTLE_ENDIAN[:2]:
+        is_too_short = len(data) < _FRAME_AT + 4
+        if is_too_short or data[:2] != LITTLE_ENDIAN[:2]:
             raise MessageError(
                 f"{self._name} of {len(data)} bytes that begin with {data[:4].hex()}: "
                 "not little-endian CDR"

@@ -188,7 +188,8 @@ def record_skin(
 
 
 def _list_recorded_topics(
-    surroundings: dict[str, Any], namespace: str
+    surroundings: dict[str, Any],
+    namespace: str,
 ) -> dict[str, dict[str, str]]:
     """Return the full names of the recorded topics and the quality of service of each.
 
@@ -231,7 +232,10 @@ def stay_ended(event: ProcessExited, context: LaunchContext) -> Action | None:
     return EmitEvent(event=ShutdownProcess(process_matcher=matches_action(event.action)))
 
 
-def check_arguments(context: LaunchContext, declared: Iterable[str]) -> SkinArguments:
+def check_arguments(
+    context: LaunchContext,
+    declared: Iterable[str],
+) -> SkinArguments:
     """Check all launch arguments, before anything starts.
 
     Args:

@@ -50,7 +50,10 @@ class MissingMotion(CubeError):
     """The motion of the skin is unknown. The text of the error states the reason and the remedy."""
 
 
-def make_motion_source(node: CubeNode, parent_frame: str) -> ImuMotion | GravityMotion | None:
+def make_motion_source(
+    node: CubeNode,
+    parent_frame: str,
+) -> ImuMotion | GravityMotion | None:
     """Return the source of the motion that a parameter of a node selects.
 
     The parameter `imu` selects an IMU by its topic, and the parameter `gravity` selects TF by the
@@ -87,7 +90,11 @@ class Transforms:
         listener = tf2_ros.TransformListener(self._buffer, node)
         node.call_at_cleanup(listener.unregister)
 
-    def newest(self, target: str, source: str) -> tuple[Array, Array, int]:
+    def newest(
+        self,
+        target: str,
+        source: str,
+    ) -> tuple[Array, Array, int]:
         """Return the newest transform from one frame to another.
 
         Args:

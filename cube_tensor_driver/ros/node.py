@@ -235,7 +235,12 @@ class CubeNode(LifecycleNode):
         **options: Any,
     ) -> Any:
         callback = self.callback_errors.catch(callback)
-        return super().create_timer(timer_period_sec, callback, *others, **options)
+        return super().create_timer(
+            timer_period_sec,
+            callback,
+            *others,
+            **options,
+        )
 
     def create_service(
         self,

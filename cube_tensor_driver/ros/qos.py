@@ -114,7 +114,10 @@ def make_profile(
     return profile
 
 
-def match_offered_profile(offers: Sequence[TopicEndpointInfo], depth: int) -> QoSProfile:
+def match_offered_profile(
+    offers: Sequence[TopicEndpointInfo],
+    depth: int,
+) -> QoSProfile:
     """Return the profile of a subscription that matches all publishers of a topic.
 
     The subscription is latched (transient local) only if all publishers are, and it is best effort

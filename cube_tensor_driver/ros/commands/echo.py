@@ -91,10 +91,18 @@ def listen(topic: str, once: bool) -> Iterator[list[Item]]:
                 f"nobody publishes {name} in {describe_domain()}; ./cube topics lists what there is"
             )
         listener.subscribe()
-        spin_until(executor, lambda: stop.is_set() or listener.has_names, MAX_INFO_S)
+        spin_until(
+            executor,
+            lambda: stop.is_set() or listener.has_names,
+            MAX_INFO_S,
+        )
         # Without `once` there is no time limit, because the user ends the command with Ctrl-C.
         wait_s = MAX_MESSAGE_S if once else float("inf")
-        while spin_until(executor, lambda: stop.is_set() or listener.waiting, wait_s):
+        while spin_until(
+            executor,
+            lambda: stop.is_set() or listener.waiting,
+            wait_s,
+        ):
             if stop.is_set():
                 return
             yield listener.take()

@@ -270,7 +270,11 @@ def _find_nodes(session: NodeSession, wanted_service: str = "") -> list[str]:
     return nodes
 
 
-def find_services(session: NodeSession, kind: str, wanted: str = "") -> list[str]:
+def find_services(
+    session: NodeSession,
+    kind: str,
+    wanted: str = "",
+) -> list[str]:
     """Return the full names of all services of one type, sorted; the list may be empty.
 
     Args:

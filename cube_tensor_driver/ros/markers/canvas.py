@@ -148,7 +148,11 @@ class Canvas:
         longest = (ranges.traction, ranges.gradient)
         shapes = []
         for scale, make_arrows, value in zip(SCALES, functions, longest, strict=True):
-            arrows = make_arrows(self._poses, values, scale.length * self._pitch / value)
+            arrows = make_arrows(
+                self._poses,
+                values,
+                scale.length * self._pitch / value,
+            )
             shapes.append(
                 draw_arrows(
                     scale,

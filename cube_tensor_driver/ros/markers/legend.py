@@ -221,7 +221,14 @@ def draw_legend(
         sign = "-" if value < 0 else "+" if quantity.signed else ""
         text = sign + format_in_four_characters(abs(value))
         centre = place.point(position, NUMBERS_LINE)
-        shapes.append(make_text(f"legend number {number}", text, height, centre))
+        shapes.append(
+            make_text(
+                f"legend number {number}",
+                text,
+                height,
+                centre,
+            )
+        )
 
     upwards = np.array([[0.0, 0.0, 1.0]])
     longest = (ranges.traction, ranges.gradient)

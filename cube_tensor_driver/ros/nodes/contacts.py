@@ -72,7 +72,11 @@ class Contacts(SkinSubscriberNode):
         )
         self._future_finder = self._worker.submit(self._set_up)
 
-    def compute_message(self, skin: FollowedSkin, health: Index) -> SkinContacts | None:
+    def compute_message(
+        self,
+        skin: FollowedSkin,
+        health: Index,
+    ) -> SkinContacts | None:
         finder = self._take_finder()
         # The finder tracks contacts over time, so it must not get the same stress twice.
         if finder is None or skin.messages == self._processed_messages:
@@ -100,7 +104,11 @@ class Contacts(SkinSubscriberNode):
                 self._traction.publish(message)
         return self._make_message(skin, finder)
 
-    def follow_stress(self, skin: FollowedSkin, health: Index) -> SkinContacts | None:
+    def follow_stress(
+        self,
+        skin: FollowedSkin,
+        health: Index,
+    ) -> SkinContacts | None:
         finder = self._finder
         if finder is None:
             return None
@@ -108,7 +116,11 @@ class Contacts(SkinSubscriberNode):
         begins = finder.follow(1e-9 * skin.stamp_ns, values)
         return self._make_message(skin, finder) if begins else None
 
-    def _make_message(self, skin: FollowedSkin, finder: ContactFinder) -> SkinContacts:
+    def _make_message(
+        self,
+        skin: FollowedSkin,
+        finder: ContactFinder,
+    ) -> SkinContacts:
         frame_id = skin.info.header.frame_id
         return make_contacts_message(
             make_message,

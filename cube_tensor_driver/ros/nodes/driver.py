@@ -66,7 +66,11 @@ class Driver(CubeNode):
         )
         self._info = self.own(self.create_publisher(SkinInfo, "driver/info", LATCHED))
         self._links = LiveLinks(
-            make_link_configs(skin, self.value("port"), self.value("port_directory")),
+            make_link_configs(
+                skin,
+                self.value("port"),
+                self.value("port_directory"),
+            ),
             make_cube_addresses(skin),
             self._publish,
             rate=rate_hz,

@@ -47,7 +47,11 @@ class Markers(SkinSubscriberNode):
 
     def prepare(self, skin: FollowedSkin) -> None:
         frame_id = skin.info.header.frame_id
-        self._canvas = Canvas(frame_id, skin.poses, crosses=self.value("crosses"))
+        self._canvas = Canvas(
+            frame_id,
+            skin.poses,
+            crosses=self.value("crosses"),
+        )
         self._ranges = scene.Ranges()
 
     def compute_message(self, skin: FollowedSkin, health: Index) -> bytes:

@@ -227,7 +227,11 @@ class Reconstruction(CubeNode):
             self._state_interfaces.publish(stress, stamp_ns)
         self._diagnostics.count(stress)
 
-    def _note_compensation(self, rows: FrequencyRows, stamp_ns: int) -> FrequencyRows:
+    def _note_compensation(
+        self,
+        rows: FrequencyRows,
+        stamp_ns: int,
+    ) -> FrequencyRows:
         """Publish the data of the compensation, and add to each row the specific force at its cube.
 
         The message `compensation` contains what a recording needs to repeat the compensation of

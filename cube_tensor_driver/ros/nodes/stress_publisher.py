@@ -286,7 +286,11 @@ class _CubePublishers:
             if publisher.get_subscription_count()
         ]
 
-    def publish(self, cube: int, message: StressTensorStamped | WrenchStamped) -> None:
+    def publish(
+        self,
+        cube: int,
+        message: StressTensorStamped | WrenchStamped,
+    ) -> None:
         """Publish a message of a cube.
 
         Args:

@@ -222,7 +222,11 @@ class Taring:
             created,
         )
 
-    def _on_tare(self, request: Tare.Request, response: Tare.Response) -> Tare.Response:
+    def _on_tare(
+        self,
+        request: Tare.Request,
+        response: Tare.Response,
+    ) -> Tare.Response:
         try:
             response.message = self._tare(request.cubes, request.duration)
             response.success = True
@@ -262,7 +266,11 @@ class Taring:
         kept = self._keep_tares(cubes, rest)
         return f"{len(cubes)} cubes, rest frequencies moved by up to {moved_ppm:.0f} ppm{kept}"
 
-    def _on_clear(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_clear(
+        self,
+        request: Trigger.Request,
+        response: Trigger.Response,
+    ) -> Trigger.Response:
         response.success = True
         response.message = "rest frequencies are the calibrations' again"
         with self._lock:

@@ -79,7 +79,12 @@ class TouchPublisher:
                 self._publisher.publish(self._make_message(touches))
             else:
                 seconds, nanoseconds = divmod(touches.stamp_ns, SECOND)
-                STAMP.pack_into(self._empty, STAMP_OFFSET, seconds, nanoseconds)
+                STAMP.pack_into(
+                    self._empty,
+                    STAMP_OFFSET,
+                    seconds,
+                    nanoseconds,
+                )
                 self._publisher.publish(bytes(self._empty))
 
     def _make_message(self, touches: Touches) -> SkinTouch:
