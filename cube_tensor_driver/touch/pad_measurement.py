@@ -70,7 +70,10 @@ functions. It applies to the relative difference of the cubes' sides, to the pos
 pads (sensing elements) in units of half a side, and to their unit normals."""
 
 
-def model_pads(influence: Influence, calibrations: Sequence[Calibration]) -> MeasurementModel:
+def model_pads(
+    influence: Influence,
+    calibrations: Sequence[Calibration],
+) -> MeasurementModel:
     """Build the measurement model of the cubes of a skin.
 
     Args:

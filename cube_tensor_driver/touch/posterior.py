@@ -189,7 +189,10 @@ class WindowPosteriors:
 
         # In `product`, all windows that are the only ones of their kind are multiplied in one
         # batch, the others one kind at a time.
-        self._rows = [(kind, np.flatnonzero(self.kind == kind)) for kind in kinds]
+        self._rows = []
+        for kind in kinds:
+            rows = np.flatnonzero(self.kind == kind)
+            self._rows.append((kind, rows))
         self._shared_kinds = [(kind, rows) for kind, rows in self._rows if len(rows) > 1]
         counts = np.bincount(self.kind)
         is_single = counts[self.kind] == 1

@@ -157,7 +157,11 @@ class Touch:
         limit: Limit h of the CUSUM, in standard deviations of the noise.
     """
 
-    def __init__(self, skin: Skin | str | Path, false_alarms: float = FALSE_ALARMS) -> None:
+    def __init__(
+        self,
+        skin: Skin | str | Path,
+        false_alarms: float = FALSE_ALARMS,
+    ) -> None:
         """Prepare the detection, which takes up to some seconds on a large bent skin.
 
         Args:

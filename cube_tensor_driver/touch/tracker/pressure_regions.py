@@ -74,7 +74,11 @@ class PressureRegions:
         self._inside = np.zeros(len(inverse.points), bool)
         self._regions: list[Index] = []
 
-    def find(self, pressure: Array, uncertain: Mask | None = None) -> list[Index]:
+    def find(
+        self,
+        pressure: Array,
+        uncertain: Mask | None = None,
+    ) -> list[Index]:
         """Find the regions in the newest scan.
 
         Args:
@@ -94,11 +98,15 @@ class PressureRegions:
             self._regions = self._connect_points()
         if uncertain is not None and uncertain.any():
             min_pressure = np.where(uncertain[self._cube], UNCERTAIN_PRESSURE, 0.0)
-            is_certain = pressure > np.where(before, RELEASE_FRACTION * min_pressure, min_pressure)
+            min_release = RELEASE_FRACTION * min_pressure
+            is_certain = pressure > np.where(before, min_release, min_pressure)
             for region in self._regions:
                 self._inside[region] = is_certain[region].any()
             self._regions = [region for region in self._regions if self._inside[region[0]]]
-        return sorted(self._regions, key=lambda region: -float(pressure[region].max()))
+        return sorted(
+            self._regions,
+            key=lambda region: -float(pressure[region].max()),
+        )
 
     def _connect_points(self) -> list[Index]:
         """Return the indices of the points of each region, without an order of the regions."""

@@ -634,7 +634,8 @@ def update_responses(
 
 
 def _update_stale_responses(
-    inverse: SurfaceInverse, stale: Sequence[tuple[TrackedRegion, Index]]
+    inverse: SurfaceInverse,
+    stale: Sequence[tuple[TrackedRegion, Index]],
 ) -> None:
     """Compute the response of cubes to the Hertz contacts of all regions in one call.
 
