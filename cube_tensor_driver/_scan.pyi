@@ -1,8 +1,8 @@
 """The kernel of a scan in C (native/python_scan.c); core/kernel/run.py tells whether it exists."""
 
-from typing import Any
+from .core.arrays import AnyArray
 
-def run(start: int, n_residuals: int, *arrays: Any) -> tuple[int, int]:
+def run(start: int, n_residuals: int, *arrays: AnyArray | None) -> tuple[int, int]:
     """Process rows from `start` on; core/kernel/run.py states arguments and results.
 
     Args:
@@ -16,7 +16,7 @@ def run(start: int, n_residuals: int, *arrays: Any) -> tuple[int, int]:
         ValueError: An array has another type or shape, or is not contiguous.
     """
 
-def forces(*arrays: Any) -> None:
+def forces(*arrays: AnyArray | None) -> None:
     """Compute the specific force at the cubes of rows; core/compensation/motion.py states how.
 
     Args:

@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 """Array of real numbers in double precision (float64)."""
 Single = NDArray[np.float32]
 """Array of real numbers in single precision (float32), the precision of the ROS messages."""
-Real = NDArray[np.floating[Any]]
+Real = NDArray[np.floating]
 """Array of float32 or float64, whichever precision the caller chose for the computation of
 stress."""
 Complex = NDArray[np.complex128]

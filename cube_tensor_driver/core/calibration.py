@@ -282,16 +282,16 @@ class Calibration:
                 f"{uid:#018x}; use the calibration of this cube"
             )
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the calibration in types that JSON has, the id first; `from_dict` reads them."""
         return {"id": self.id, **self._make_content()}
 
-    def _make_content(self) -> dict[str, Any]:
+    def _make_content(self) -> dict[str, object]:
         """Return all attributes that have a value, in types that JSON has, without the id."""
         built_in = LAYOUTS.get(self.layout.name)
         is_built_in = built_in is not None and built_in.same_as(self.layout)
         # The name of a built-in layout is enough to find its pads, and keeps files short.
-        content: dict[str, Any] = {
+        content: dict[str, object] = {
             "schema": SCHEMA,
             "layout": self.layout.name if is_built_in else self.layout.to_dict(),
             "symmetry": self.symmetry,
@@ -428,7 +428,7 @@ def _check_keys(
         )
 
 
-def _to_plain(value: Any, is_per_pad: bool) -> Any:
+def _to_plain(value: Any, is_per_pad: bool) -> object:
     """Return the value of an attribute in types that JSON has.
 
     Args:

@@ -166,7 +166,7 @@ class Layout:
             and np.array_equal(self.normals, other.normals)
         )
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the layout in plain types, which `from_dict` reads."""
         return {
             "name": self.name,

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +52,7 @@ _COMPONENT_NUMBERS = [
 """Number of the component, in the order xx, yy, zz, yz, zx, xy, at each place of the symmetric
 stress tensor (3, 3)."""
 
-Float = TypeVar("Float", bound=np.floating[Any])
+Float = TypeVar("Float", bound=np.floating)
 
 
 def to_matrix(stress: NDArray[Float]) -> NDArray[Float]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -222,7 +222,7 @@ def concatenate(parts: Sequence[_Kind]) -> _Kind:
     return type(parts[0])(**joined)
 
 
-def _fill_columns(cube: ArrayLike, **columns: Any) -> dict[str, AnyArray]:
+def _fill_columns(cube: ArrayLike, **columns: ArrayLike) -> dict[str, AnyArray]:
     """Return the columns (N,) of N rows by name, with the types of `COLUMN_TYPES`.
 
     Args:
@@ -244,7 +244,7 @@ class Source(Protocol):
     """
 
     @property
-    def skin(self) -> Any:
+    def skin(self) -> object:
         """The skin; `FrequencyRows.cube` is an index into its cubes."""
 
     @property

@@ -14,7 +14,6 @@ import os
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -47,7 +46,7 @@ def cache_folder() -> Path:
 
 def load_or_compute(
     kind: str,
-    inputs: Iterable[Any],
+    inputs: Iterable[object],
     compute: Callable[[], Arrays],
 ) -> Arrays:
     """Load arrays from the cache, or compute and store them.
@@ -72,7 +71,7 @@ def load_or_compute(
     return arrays
 
 
-def _hash_inputs(inputs: Iterable[Any]) -> str:
+def _hash_inputs(inputs: Iterable[object]) -> str:
     """Return a hash of everything a cached result depends on, as 32 hexadecimal digits.
 
     Args:

@@ -24,11 +24,10 @@ elements.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, Complex
+from ..core.arrays import AnyArray, Array, Complex
 from ..core.defaults import POISSONS_RATIO
 from ..core.errors import ElasticError
 from ..core.modes import COMPONENTS, STRESS
@@ -41,7 +40,7 @@ MEASURED = [FIELD.index(name) for name in COMPONENTS]
 """Indices (15) in `FIELD` of the `COMPONENTS` that cubes measure: six stresses and the nine
 gradients of the normal stresses."""
 
-_WaveStress = dict[str, tuple[Any, Any]]
+_WaveStress = dict[str, tuple[AnyArray, AnyArray]]
 """Stress under a wave of traction on the surface, and the derivative of this stress along z. A key
 such as "LzT" names the stress component Lz and the direction T of the traction, in the axes of the
 wave: L along its wave vector, T across it."""
@@ -299,7 +298,7 @@ def _add_rotated(
     cs = c * s
     # `stress_rows` has the factors with which a stress component in the wave's axes contributes to
     # the stresses xx, yy, zz, yz, zx and xy (indices 0 to 5).
-    stress_rows: dict[str, dict[int, Any]] = {
+    stress_rows: dict[str, dict[int, Array | float]] = {
         "LL": {0: cc, 1: ss, 5: cs},
         "TT": {0: ss, 1: cc, 5: -cs},
         "LT": {0: -2 * cs, 1: 2 * cs, 5: cc - ss},
@@ -309,7 +308,7 @@ def _add_rotated(
     }
     # `load_columns` has the components along L, T and z of unit tractions along x, y and z (indices
     # 0 to 2).
-    load_columns: dict[str, dict[int, Any]] = {
+    load_columns: dict[str, dict[int, Array | float]] = {
         "L": {0: c, 1: s},
         "T": {0: -s, 1: c},
         "z": {2: 1.0},

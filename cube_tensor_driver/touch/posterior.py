@@ -26,7 +26,7 @@ Source: C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learn
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -145,7 +145,7 @@ class WindowPosteriors:
         # The matrices are computed for the first window of each kind, and serve for all of them.
         kinds, first = np.unique(self.kind, return_index=True)
         example = model.select(self.near[first])
-        inputs: list[Any] = [
+        inputs: list[object] = [
             *traction_prior.inputs,
             spacing,
             side,

@@ -14,7 +14,7 @@ Force and position of a contact follow from the equilibrium of the layer above t
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -26,6 +26,9 @@ from ..core.errors import ElasticError
 from ..core.modes import COMPONENTS
 from ..core.poses import CubePoses
 from .interpolation import Interpolation
+
+if TYPE_CHECKING:
+    from .tracker.contact_tracker import TrackedContact
 
 PRESSURE = [COMPONENTS.index(name) for name in ("zz", "zz_x", "zz_y")]
 """Columns of the stress σzz (negative pressure) and of its derivatives along x and y in
@@ -90,7 +93,7 @@ class Contact(NamedTuple):
         return f"Contact({describe_contact(self)})"
 
 
-def describe_contact(contact: Any) -> str:
+def describe_contact(contact: Contact | TrackedContact) -> str:
     """Describe a contact by its forces, position and area.
 
     Args:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields
-from typing import Any, ClassVar, TypeVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 
@@ -67,9 +67,9 @@ class EffectModel:
         values = getattr(self, per_pad[0])
         return len(values)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the model as a table of numbers and lists, which `from_dict` reads."""
-        table: dict[str, Any] = {}
+        table: dict[str, object] = {}
         for name in self.axes:
             value = getattr(self, name)
             if value is not None:
@@ -77,7 +77,7 @@ class EffectModel:
         return table
 
     @classmethod
-    def from_dict(cls: type[_Model], data: Any) -> _Model:
+    def from_dict(cls: type[_Model], data: object) -> _Model:
         """Construct a model from the plain types that `to_dict` returns.
 
         Raises:
