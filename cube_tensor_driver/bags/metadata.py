@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
@@ -26,6 +26,7 @@ from ..core.errors import BagError, ConfigError
 from ..messages.types import PACKAGE
 
 if TYPE_CHECKING:
+    from rosbags.interfaces.typing import Typesdict
     from rosbags.typesys.store import Typestore
 
 FILE_NAME = "metadata.yaml"
@@ -46,7 +47,7 @@ _UNLIMITED_DURATION = {"sec": 9223372036, "nsec": 854775807}
 """Duration that states "no limit" in a quality of service profile of DDS (the middleware of ROS 2):
 the largest number of nanoseconds in 64 bits, divided into seconds and nanoseconds."""
 
-QosProfile = dict[str, Any]
+QosProfile = dict[str, object]
 """Quality of service profile of a publisher, as metadata.yaml lists it: key, such as
 ``reliability``, and value."""
 
@@ -156,7 +157,7 @@ def parse_profiles(text: str, topic: str) -> Sequence[QosProfile]:
 def make_typestore() -> Typestore:
     """Return the message types of ROS 2 Jazzy and of the installed version of this package."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    types: dict[str, Any] = {}
+    types: Typesdict = {}
     folder = package_data() / "msg"
     for path in sorted(folder.glob("*.msg")):
         name = f"{PACKAGE}/msg/{path.stem}"
@@ -247,7 +248,7 @@ def write_metadata(
 def make_bag_information(
     storage: str,
     files: Sequence[FileSummary],
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return the content of metadata.yaml, with every key that rosbag2 requires.
 
     Args:
@@ -301,7 +302,7 @@ def merge_connections(of_files: Iterable[Sequence[Connection]]) -> list[Connecti
     return list(merged.values())
 
 
-def _time_span(start_ns: int, end_ns: int) -> dict[str, Any]:
+def _time_span(start_ns: int, end_ns: int) -> dict[str, object]:
     """Return begin and duration of a span of time with the keys of metadata.yaml.
 
     Args:
@@ -314,7 +315,7 @@ def _time_span(start_ns: int, end_ns: int) -> dict[str, Any]:
     }
 
 
-def _make_topic_information(connection: Connection) -> dict[str, Any]:
+def _make_topic_information(connection: Connection) -> dict[str, object]:
     """Return the entry of a topic in metadata.yaml, with the keys that rosbag2 requires.
 
     Args:

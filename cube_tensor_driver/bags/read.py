@@ -17,7 +17,7 @@ from contextlib import ExitStack, contextmanager
 from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 import zstandard
@@ -34,6 +34,9 @@ from .mcap_file import McapReader
 from .metadata import SUFFIXES, make_typestore, merge_connections, read_metadata
 from .sqlite_file import SqliteReader
 from .stored_messages import StoredMessages, join_in_blocks
+
+if TYPE_CHECKING:
+    from rosbags.interfaces.typing import Fielddefs
 
 MAX_DISORDER_NS = SECOND
 """Largest difference of stamps, in ns, by which messages and samples in a bag may be out of order.
@@ -94,6 +97,8 @@ READ_ERRORS = (
 """
 
 _log = logging.getLogger(__name__)
+
+_Batch = TypeVar("_Batch")
 
 
 def is_bag(path: Path) -> bool:
@@ -461,7 +466,7 @@ class Bag:
     def columns(
         self,
         topic: str,
-        codec: MessageCodec[Any],
+        codec: MessageCodec[FrequencyRows] | MessageCodec[StressRows],
         names: Sequence[str],
     ) -> Iterator[list[AnyArray]]:
         """Read some columns of frequencies or stress, which is faster than reading all.
@@ -480,9 +485,9 @@ class Bag:
     def _decode_batches(
         self,
         topic: str,
-        codec: MessageCodec[Any],
-        decode: Callable[..., Any],
-    ) -> Iterator[tuple[Any, Times]]:
+        codec: MessageCodec[FrequencyRows] | MessageCodec[StressRows],
+        decode: Callable[[AnyArray], _Batch],
+    ) -> Iterator[tuple[_Batch, Times]]:
         """Decode successive messages of equal shape (frame id, number of rows) in batches.
 
         Args:
@@ -500,7 +505,7 @@ class Bag:
         shape: tuple[int, bytes] = 0, b""
         limit = room = 0
 
-        def decode_waiting() -> Iterator[tuple[Any, Times]]:
+        def decode_waiting() -> Iterator[tuple[_Batch, Times]]:
             """Decode the collected messages together or, if one is damaged, each alone."""
             together, at_ns = np.concatenate(waiting), np.concatenate(times_ns)
             try:
@@ -584,7 +589,7 @@ class Bag:
         )
 
 
-def message_fields(msgtype: str) -> list[tuple[str, Any]]:
+def message_fields(msgtype: str) -> Fielddefs:
     """Return name and kind of each field of a message type, as the library rosbags states them.
 
     The list is empty if the type is unknown.

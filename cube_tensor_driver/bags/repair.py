@@ -25,7 +25,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, suppress
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple, TypeVar
 from zlib import crc32
 
 from mcap.data_stream import ReadDataStream, RecordBuilder
@@ -494,7 +494,10 @@ def _records(stream: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
         start += RECORD_HEAD.size + length
 
 
-def _parse(read: Callable[[ReadDataStream], Any], content: bytes) -> Any:
+_Record = TypeVar("_Record", bound=McapRecord)
+
+
+def _parse(read: Callable[[ReadDataStream], _Record], content: bytes) -> _Record:
     """Parse an MCAP record.
 
     Args:

@@ -7,11 +7,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
-from ..core.arrays import AnyArray, Index, Times
+from ..core.arrays import AnyArray, Index, Mask, Times
 
 BLOCK_BYTES = 1 << 18
 """Minimum total size, in bytes, of the messages that are joined to one block if the storage file is
@@ -46,7 +45,7 @@ class StoredMessages:
         for channel, time_ns, begin, end in zip(*lists, strict=True):
             yield channel, time_ns, self.data[begin:end]
 
-    def select(self, chosen: Any) -> StoredMessages:
+    def select(self, chosen: slice | Index | Mask) -> StoredMessages:
         """Return the messages that are chosen by a slice, a mask or their indices."""
         return StoredMessages(
             self.data,

@@ -6,13 +6,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..core.rows import COUNTER_RANGE
 from ..messages.codec import frequency_codec
 from .read import Bag
+
+if TYPE_CHECKING:
+    from rosbags.typesys.stores.ros2_jazzy import (
+        diagnostic_msgs__msg__DiagnosticStatus as DiagnosticStatus,
+    )
 
 DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 """Message type of the diagnostics, which state the condition of each node and cube."""
@@ -77,7 +82,7 @@ def summarise_cubes(bag: Bag, topic: str, n_cubes: int) -> Iterator[CubeSummary]
         )
 
 
-def last_diagnostics(bag: Bag) -> list[Any]:
+def last_diagnostics(bag: Bag) -> list[DiagnosticStatus]:
     """Return the last recorded DiagnosticStatus of each name, sorted by name."""
     # Entries come in the order of recording, so a later status replaces an earlier one.
     last = {}

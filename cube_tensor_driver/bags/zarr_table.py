@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import zarr
@@ -27,7 +26,7 @@ _COMPONENTS = {"stress": STRESS, "gradient": GRADIENT}
 """Names of the components of each column with several numbers per row, such as xx, yy, … of
 stress."""
 
-_TYPES: dict[str, Any] = {
+_TYPES: dict[str, type] = {
     "cube": np.uint16,
     "stress": np.float32,
     "gradient": np.float32,
@@ -71,10 +70,10 @@ class ZarrWriter(BufferedTable):
 
 
 def _create_column(
-    group: Any,
+    group: zarr.Group,
     name: str,
     cubes: list[str],
-) -> Any:
+) -> zarr.Array:
     """Create the empty array of one column, with its unit and components as attributes.
 
     Args:
@@ -84,7 +83,7 @@ def _create_column(
     """
     components = _COMPONENTS.get(name, ())
     width = (len(components),) if components else ()
-    attributes: dict[str, Any] = {}
+    attributes: dict[str, object] = {}
     if name in _UNITS:
         attributes["units"] = _UNITS[name]
     if components:

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ...config.yaml import read_yaml, write_yaml
 from ...core.errors import BagError, CubeError
@@ -89,7 +89,7 @@ def write_recipe(folder: Path, job: ReprocessJob) -> None:
     """
     overrides, contacts = job.overrides, job.contacts
     cubes = overrides.skin.cubes if overrides.skin else ()
-    recipe: dict[str, Any] = {
+    recipe: dict[str, object] = {
         "format": job.form,
         "calibration": overrides.calibration.id if overrides.calibration else None,
         "skin": {cube.name: cube.calibration.id for cube in cubes} or None,

@@ -10,7 +10,7 @@ from typing import Any
 from ...core.arrays import Times
 from ...core.errors import BagError
 from ...core.latest_stress import STALE_S, LatestStress
-from ...core.rows import StressRows
+from ...core.rows import FrequencyRows, StressRows
 from ...messages.codec import Decoded
 from ...messages.contacts import make_contacts_message, make_traction_message
 from ...messages.skin_info import (
@@ -100,7 +100,7 @@ class ContactWriter:
     def write(
         self,
         stress: StressRows,
-        messages: Decoded[Any],
+        messages: Decoded[FrequencyRows],
         recorded_ns: Times,
     ) -> None:
         """Compute contacts from the stress of M messages and write them into the bag.

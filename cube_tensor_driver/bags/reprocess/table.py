@@ -9,7 +9,6 @@ between their worker processes.
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pyarrow
@@ -180,7 +179,7 @@ def reprocess_table(
     return pyarrow.Table.from_batches(batches, STRESS_SCHEMA)
 
 
-def _read_recorded_health(columns: dict[str, Any]) -> RecordedHealth | None:
+def _read_recorded_health(columns: dict[str, pyarrow.Array]) -> RecordedHealth | None:
     """Return the recorded health of the pads from Arrow columns; None if they are missing."""
     if not columns.keys() >= {"recorded_left_out", "recorded_status"}:
         return None
@@ -193,7 +192,7 @@ def _read_recorded_health(columns: dict[str, Any]) -> RecordedHealth | None:
     )
 
 
-def _restore(reconstructor: Reconstructor, columns: dict[str, Any]) -> None:
+def _restore(reconstructor: Reconstructor, columns: dict[str, pyarrow.Array]) -> None:
     """Set recorded rest frequencies and states of creep and temperature in a reconstructor.
 
     Args:
