@@ -25,7 +25,7 @@ LEGEND_HEIGHT = 0.8
 width of the skin (along x)."""
 
 
-def make_rviz_view(skin: Skin) -> dict[str, Any]:
+def make_rviz_view(skin: Skin) -> dict[str, object]:
     """Return the content of rviz/skin.rviz, adapted to a skin, as plain values for `write_yaml`.
 
     The fixed frame is the parent frame of the skin, the camera shows the whole skin and its legend,

@@ -52,8 +52,8 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
         # A mapping may override keys that "<<" copies from another mapping. Therefore its own keys
         # are listed now, before PyYAML inserts the copied ones into the node.
         own_keys = [key for key, _ in node.value if key.tag != _MERGE_TAG]
-        mapping: dict[Any, Any] = super().construct_mapping(node, deep)
-        seen: set[Any] = set()
+        mapping: dict[object, object] = super().construct_mapping(node, deep)
+        seen: set[object] = set()
         for key in own_keys:
             name = self.construct_object(key, deep=True)
             if name in seen:

@@ -130,7 +130,7 @@ class _Layout(NamedTuple):
     """
 
     shape: _Shape
-    record: np.dtype[Any]
+    record: np.dtype[np.void]
     sequences: list[str]
     counts: list[int]
     numbers: struct.Struct
@@ -475,7 +475,7 @@ class MessageCodec(Generic[AnyRows]):
 
     def _make_layout(self, shape: _Shape) -> _Layout:
         # Each entry of the structured dtype has a name, a type and a byte offset.
-        entries: list[tuple[str, Any, int]] = [
+        entries: list[tuple[str, object, int]] = [
             ("encapsulation", "S4", 0),
             ("sec", "<i4", _SECONDS_AT),
             ("nanosec", "<u4", _NANOSECONDS_AT),

@@ -61,7 +61,7 @@ def make_contacts_message(
     frame_id: str,
     contacts: Sequence[Contact] | Sequence[TrackedContact],
     slip: Slip = NO_CONTACTS,
-) -> Any:
+) -> object:
     """Make a SkinContacts message.
 
     Args:
@@ -76,7 +76,7 @@ def make_contacts_message(
     tracked = [contact for contact in contacts if isinstance(contact, TrackedContact)]
     ids = [contact.id for contact in tracked]
     are_refined = [contact.refined for contact in tracked]
-    fields: dict[str, Any] = {name: _collect(contacts, name) for name in _NUMBERS}
+    fields: dict[str, object] = {name: _collect(contacts, name) for name in _NUMBERS}
     fields |= {name: _collect(tracked, name) for name in _TRACKED_NUMBERS}
     fields["id"] = np.array(ids, np.uint32)
     fields["refined"] = np.array(are_refined, bool)
@@ -95,7 +95,7 @@ def make_traction_message(
     stamp_ns: int,
     frame_id: str,
     cloud: Array,
-) -> Any:
+) -> object:
     """Make a PointCloud2 message of the traction (pressure and shear stress) on the surface.
 
     Args:
@@ -161,7 +161,7 @@ def decode_traction(message: Any) -> Array:
     return points.reshape(-1, len(CLOUD)).astype(float)
 
 
-def _collect(contacts: Sequence[Any], name: str) -> Array:
+def _collect(contacts: Sequence[object], name: str) -> Array:
     """Return one attribute of all contacts as an array whose first axis counts the contacts."""
     return np.array([getattr(contact, name) for contact in contacts], float)
 
@@ -170,6 +170,6 @@ def _make_xyz(
     make: MakeMessage,
     kind: str,
     vector: Array,
-) -> Any:
+) -> object:
     x, y, z = vector.tolist()
     return make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)

@@ -69,7 +69,7 @@ def make_cloud_message(
     )
 
 
-def make_header(make: MakeMessage, stamp_ns: int, frame_id: str) -> Any:
+def make_header(make: MakeMessage, stamp_ns: int, frame_id: str) -> object:
     """Make a header.
 
     Args:
