@@ -7,7 +7,7 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import viser
@@ -154,7 +154,7 @@ class Charts:
         self._plots: list[viser.GuiUplotHandle | None] = [None] * len(FIRST_GROUPS)
 
         @files.on_click
-        def _(event: viser.GuiEvent[Any]) -> None:
+        def _(event: viser.GuiEvent[viser.GuiButtonGroupHandle]) -> None:
             self._save(event.client, str(files.value))
 
     def choose(self, history: History, chosen: int) -> tuple[Chart, ...]:
@@ -179,7 +179,7 @@ class Charts:
                 self._charts[number] = chart
         return tuple(self._charts)
 
-    def replace_plots(self, charts: Sequence[Chart]) -> dict[str, Any]:
+    def replace_plots(self, charts: Sequence[Chart]) -> dict[str, viser.GuiUplotHandle]:
         """Replace the plots whose lines have changed, as uPlot cannot add a line to a plot.
 
         Args:
@@ -188,7 +188,7 @@ class Charts:
         Returns:
             Name of each new plot -> the plot.
         """
-        new: dict[str, Any] = {}
+        new: dict[str, viser.GuiUplotHandle] = {}
         for number, chart in enumerate(charts):
             plot = self._plots[number]
             # A plot is made only when its chart has lines; until then both lists are empty.
@@ -285,7 +285,7 @@ def make_chart(
     return Chart(f"{group} / {unit}", size, lines)
 
 
-def make_chart_properties(history: History, chart: Chart) -> dict[str, Any]:
+def make_chart_properties(history: History, chart: Chart) -> dict[str, object]:
     """Return the data and the axis ranges of a plot as properties of viser; {} without lines.
 
     Args:

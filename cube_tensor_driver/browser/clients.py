@@ -57,7 +57,7 @@ class ServiceCalls:
         self,
         what: str,
         client: Client,
-        request: Any,
+        request: object,
         notes_success: bool = True,
     ) -> None:
         """Call a service; if no running node offers it, show a note instead.

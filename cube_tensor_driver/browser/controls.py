@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Protocol
 
 import viser
 
@@ -110,7 +110,7 @@ class ReplayControls:
         self._button.on_click(lambda _: hold())
 
         @self._slider.on_update
-        def _(event: viser.GuiEvent[Any]) -> None:
+        def _(event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
             # `_move_slider` triggers this function, too; such an event has no client (browser).
             if event.client is None:
                 return

@@ -20,11 +20,11 @@ import http
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 import websockets.asyncio.server
 from websockets import Headers
+from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from ..core.errors import ConfigError
@@ -91,6 +91,10 @@ def check_host(host: str) -> None:
         ) from None
 
 
+ProcessRequest = Callable[[ServerConnection, Request], Response | None]
+"""Function that answers an HTTP request, or returns None to continue with the websocket."""
+
+
 @contextmanager
 def guarded_server(token: str = "") -> Iterator[None]:
     """Make a websocket server that is created in this `with` block check each request.
@@ -101,14 +105,14 @@ def guarded_server(token: str = "") -> Iterator[None]:
         token: Secret text that a browser must send: once in the address (?token=…), and from then
             on as a cookie. Empty if the server listens on this machine only and needs none.
     """
-    serve: Callable[..., Any] = websockets.asyncio.server.serve
+    serve: Callable[..., object] = websockets.asyncio.server.serve
 
     def guarded_serve(
-        *arguments: Any,
-        process_request: Callable[..., Any],
-        **options: Any,
-    ) -> Any:
-        def check(connection: Any, request: Request) -> Any:
+        *arguments: object,
+        process_request: ProcessRequest,
+        **options: object,
+    ) -> object:
+        def check(connection: ServerConnection, request: Request) -> Response | None:
             return _answer(connection, request, token, process_request)
 
         return serve(*arguments, process_request=check, **options)
@@ -121,11 +125,11 @@ def guarded_server(token: str = "") -> Iterator[None]:
 
 
 def _answer(
-    connection: Any,
+    connection: ServerConnection,
     request: Request,
     token: str,
-    process_request: Callable[..., Any],
-) -> Any:
+    process_request: ProcessRequest,
+) -> Response | None:
     """Refuse a request, or let viser answer it and add a cookie with the token to the answer.
 
     Args:

@@ -156,7 +156,7 @@ class Page:
         self._quantity: Quantity | None = None
         self._cube = skin.scene.first_cube
         self._noted = ""
-        self._sent: dict[tuple[str, str], Any] = {}
+        self._sent: dict[tuple[str, str], object] = {}
         set_up(client, layout, skin.name)
         self._objects = skin.scene.add_to(client.scene, self._choose)
         self._make_controls(client.gui, act)
@@ -327,7 +327,7 @@ class Page:
 
         @self._view.on_click
         @zero.on_click
-        def _(event: viser.GuiEvent[Any]) -> None:
+        def _(event: viser.GuiEvent[viser.GuiButtonGroupHandle]) -> None:
             label = str(event.target.value)
             if label in (PAUSE, GO_ON):
                 self._paused = not self._paused

@@ -8,7 +8,7 @@ Everything that the page shows at a time comes from one `Scan`.
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 from ..core.arrays import AnyArray, Array
 from ..core.latest_stress import LatestStress
@@ -155,10 +155,13 @@ class ScanSynchronizer:
         return True
 
 
+_Result = TypeVar("_Result")
+
+
 def _add_result(
-    results: dict[int, Any],
+    results: dict[int, _Result],
     stamp_ns: int,
-    result: Any,
+    result: _Result,
 ) -> None:
     """Store a result under its stamp, and forget the oldest of more than `MAX_RESULTS`."""
     # After a jump of a replay, the same stamp can come again. A dict would keep its old position,

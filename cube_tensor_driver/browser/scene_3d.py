@@ -35,7 +35,7 @@ from ..views.round_numbers import round_down
 from .colouring import Colouring
 from .scan import Scan
 
-Properties = dict[str, Any]
+Properties = dict[str, object]
 """Name of a property of an object on the page (of the 3-D scene or a control) -> its value."""
 
 Update = dict[str, Properties]
@@ -238,7 +238,7 @@ class Scene:
         self,
         api: viser.SceneApi,
         pick: Callable[[int], None],
-    ) -> dict[str, Any]:
+    ) -> dict[str, object]:
         """Add all objects to the scene of a browser.
 
         Args:
@@ -252,7 +252,7 @@ class Scene:
         self._add_scale_bar(api)
         if self._is_solid:
             self._add_edges(api)
-        objects: dict[str, Any] = {
+        objects: dict[str, object] = {
             f"field/{step}": api.add_mesh_simple(
                 f"/field/{step}",
                 *NO_MESH,
@@ -486,7 +486,7 @@ class Scene:
                 anchor="center-center",
             )
 
-    def _add_cubes(self, api: viser.SceneApi) -> Any:
+    def _add_cubes(self, api: viser.SceneApi) -> viser.SceneNodeHandle:
         poses = self._placement.poses
         return api.add_batched_meshes_simple(
             "/cubes",
@@ -515,7 +515,7 @@ class Scene:
             thickness_units="screen",
         )
 
-    def _add_names(self, api: viser.SceneApi) -> Any:
+    def _add_names(self, api: viser.SceneApi) -> viser.FrameHandle:
         """Add the names of the cubes, each in front of its cube; none above `MAX_NAMED_CUBES`."""
         # All names are children of one frame in viser, so that a single message to the browser,
         # which hides the frame, hides all names.

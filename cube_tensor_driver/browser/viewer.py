@@ -19,7 +19,6 @@ import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import viser
@@ -242,7 +241,7 @@ class Viewer:
             show_waiting(client, layout, markup.waiting(describe_domain()))
             return
 
-        def act(action: str, *arguments: Any) -> None:
+        def act(action: str, *arguments: object) -> None:
             # A browser may send any text, and unknown ones do nothing.
             if action in self._commands:
                 self._actions.put(partial(self._commands[action], *arguments))
