@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow
@@ -95,13 +94,13 @@ class DataSet:
         (folder / "meta" / "episodes" / "chunk-000").mkdir(parents=True)
         self.fps, self.depth = fps, depth
         self.frames = 0
-        self.episodes: list[dict[str, Any]] = []
-        self.calibrations: list[dict[str, Any]] = []
+        self.episodes: list[dict[str, object]] = []
+        self.calibrations: list[dict[str, object]] = []
         self._folder = folder
         self._skin = skin
         self._topics = topics
         self._tasks: list[str] = []
-        self._writer: Any = None
+        self._writer: pyarrow.parquet.ParquetWriter | None = None
         self._file_number = 0
         # Integer columns beside the stress (stamps, status bits) have no statistics, because
         # policies do not normalise them. Statistics of the stress have one row for each sample of a
@@ -235,7 +234,7 @@ class DataSet:
         chunk, file = divmod(self._file_number, MAX_FILES_PER_CHUNK)
         return {"chunk_index": chunk, "file_index": file}
 
-    def _describe_features(self) -> dict[str, Any]:
+    def _describe_features(self) -> dict[str, dict[str, object]]:
         """Return the description of all features (columns of the data set) for info.json.
 
         The skin is described under the key ``info`` of the tactile feature, because LeRobot's tools
@@ -280,7 +279,7 @@ def _as_column(values: AnyArray | list[bytes]) -> pyarrow.Array:
     return as_column(values[:, 0] if is_one_number else values)
 
 
-def describe_skin(skin: Skin) -> dict[str, Any]:
+def describe_skin(skin: Skin) -> dict[str, object]:
     """Describe the feature `observation.tactile` (stress): components, units, and cubes' poses."""
     cubes = [
         {
@@ -309,7 +308,7 @@ def _describe_feature(
     dtype: str,
     shape: tuple[int, ...],
     names: list[str] | None,
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return the description of one feature (column of the data set) for info.json.
 
     Args:
@@ -327,7 +326,7 @@ def _describe_feature(
 def _as_lists(
     statistics: Statistics,
     frames: int,
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return the statistics of a feature as lists, which JSON and Parquet can contain.
 
     Args:
@@ -362,7 +361,7 @@ def _make_task_table(tasks: list[str]) -> pyarrow.Table:
     return table.replace_schema_metadata({"pandas": json.dumps(described)})
 
 
-def _write_json(path: Path, value: Any) -> None:
+def _write_json(path: Path, value: object) -> None:
     """Write a value to a JSON file as LeRobot does: indented, in UTF-8."""
     text = json.dumps(value, indent=4, ensure_ascii=False)
     path.write_text(text + "\n", encoding="utf-8")

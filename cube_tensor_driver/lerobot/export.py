@@ -261,7 +261,7 @@ def _check_same_skin(plans: list[BagPlan]) -> Skin:
         BagError: The cubes of two bags differ in their names or poses.
     """
 
-    def places(plan: BagPlan) -> list[Any]:
+    def places(plan: BagPlan) -> list[object]:
         """Return name and pose of each cube of a bag."""
         cubes = plan.skin.cubes
         return [(cube.name, cube.xyz, cube.rpy) for cube in cubes]

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
@@ -15,6 +15,9 @@ from ..bags.read import Bag, stamp_ns
 from ..core.arrays import Single
 from ..core.errors import BagError
 from .plan import Episode
+
+if TYPE_CHECKING:
+    from rosbags.typesys.stores.ros2_jazzy import sensor_msgs__msg__Image as ImageMessage
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 """ROS message types that contain one image."""
@@ -161,7 +164,7 @@ class ImageStream:
         ) from None
 
 
-def encode_raw(message: Any) -> bytes:
+def encode_raw(message: ImageMessage) -> bytes:
     """Encode a sensor_msgs/Image (uncompressed pixels) as PNG.
 
     Raises:

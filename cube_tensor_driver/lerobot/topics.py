@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter, itemgetter
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -23,6 +23,9 @@ from ..core.errors import BagError
 from ..messages.types import PACKAGE
 from .images import IMAGE_TYPES, ImageStream, Shape
 from .plan import Choices, Episode
+
+if TYPE_CHECKING:
+    from rosbags.typesys.stores.ros2_jazzy import sensor_msgs__msg__JointState as JointState
 
 JOINT_STATE_TYPE = "sensor_msgs/msg/JointState"
 """Message type of joint states: names, positions, velocities and efforts of a robot's joints."""
@@ -299,7 +302,7 @@ def _list_nested_paths(
 
 
 def _find_joint_numbers(
-    message: Any,
+    message: JointState,
     where: str,
 ) -> dict[str, float]:
     """Return the numbers in a JointState message by their names, such as ``elbow.position``.

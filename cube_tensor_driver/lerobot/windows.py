@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from ..core.rows import COLUMN_TYPES, StressRows, concatenate
 TACTILE = "observation.tactile"
 """Name of the feature (column of a data set) that contains the stress of all cubes."""
 
-WINDOW_COLUMNS: dict[str, Any] = {
+WINDOW_COLUMNS: dict[str, type] = {
     name: COLUMN_TYPES[name]
     for name in ("stamp_ns", "sequence", "residual", "status", "observed", "left_out")
 }
@@ -144,7 +143,7 @@ def arrange_windows(
     windows: dict[str, AnyArray] = {TACTILE: tactile}
     for name, kind in WINDOW_COLUMNS.items():
         empty = np.nan if kind is np.float32 else 0
-        column = np.full(shape, empty, kind)
+        column: AnyArray = np.full(shape, empty, kind)
         column[place] = getattr(rows, name)[order]
         windows[f"{TACTILE}.{name}"] = column
     windows[f"{TACTILE}.count"] = counts.astype(np.int64)
