@@ -17,7 +17,6 @@ import sys
 import textwrap
 import threading
 from collections.abc import Sequence
-from typing import Any
 
 from ..processes.stop_signals import INTERRUPTED
 from .parser import Parser, check_outputs, columns, nearest, sentence
@@ -202,7 +201,7 @@ def version() -> str:
         return metadata.version("cube_tensor_driver")
 
 
-def interrupt_again(lost: Any) -> None:
+def interrupt_again(lost: sys.UnraisableHookArgs) -> None:
     """Send SIGINT again after Python has lost a Ctrl-C; a function for `sys.unraisablehook`.
 
     Python drops the KeyboardInterrupt of a Ctrl-C that arrives in a destructor or at the end of an

@@ -42,13 +42,13 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, **settings: Any) -> None:
         self._flags: list[str] = []
         self._outputs: list[Output] = []
-        self._subcommands: Any = None
+        self._subcommands: argparse._SubParsersAction[Parser] | None = None
         self._passes_words = False
         self._missing = ""
         settings.setdefault("formatter_class", formatter)
         super().__init__(**settings)
 
-    def add_argument(self, *flags: Any, **settings: Any) -> argparse.Action:
+    def add_argument(self, *flags: str, **settings: Any) -> argparse.Action:
         action = super().add_argument(*flags, **settings)
         self._flags += action.option_strings
         return action

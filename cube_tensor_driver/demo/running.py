@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
@@ -43,7 +44,7 @@ class Observer:
     """
 
     node: Node
-    executor: Any
+    executor: Executor
     children: Children
     interrupted: threading.Event | None
     on_step: Callable[[], None]
@@ -150,7 +151,7 @@ def end_simulator(children: Children, log: Path) -> SampleLog:
     return SampleLog.read(log)
 
 
-def report(result: dict[str, Any], json_path: Path | None) -> None:
+def report(result: dict[str, object], json_path: Path | None) -> None:
     """Print results as JSON, and write them to a file as well if there is a path.
 
     Args:

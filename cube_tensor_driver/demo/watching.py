@@ -10,7 +10,7 @@ import time
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from diagnostic_msgs.msg import DiagnosticArray
 
@@ -58,7 +58,7 @@ class DemoResult:
         verification: The rows that arrived, from which the forces are computed.
     """
 
-    figures: dict[str, Any]
+    figures: dict[str, object]
     verification: LoadVerification
 
     def publish(self, settings: DemoSettings) -> None:

@@ -10,7 +10,7 @@ Python handles all others, for example those after lost samples or after a resta
 
 from __future__ import annotations
 
-from ctypes import Structure, c_double, c_int64
+from ctypes import Array, Structure, c_double, c_int64
 from typing import Any
 
 MAX_DISORDER = 64
@@ -28,7 +28,7 @@ NEVER = -(1 << 62)
 """Time, in ns, that is earlier than every device time (hub's clock) and every host time. The
 time of a sample, such as the newest one, has this value as long as there is no such sample."""
 
-_TYPES: dict[str, Any] = {
+_TYPES: dict[str, type[c_int64 | c_double | Array[Array[c_int64]]]] = {
     "int": c_int64,
     "bool": c_int64,
     "float": c_double,

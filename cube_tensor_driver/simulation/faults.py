@@ -131,7 +131,7 @@ class Fault:
         return cls(**values)
 
 
-def parse_faults(data: Any, place: str) -> list[Fault]:
+def parse_faults(data: object, place: str) -> list[Fault]:
     """Create faults from a list of dictionaries and check them.
 
     Args:

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from itertools import combinations, product
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from ..core.arrays import AnyArray, Array, Index, Mask
 from . import scene
 from .scene import Quantity
 
-Mesh = tuple[NDArray[Any], NDArray[Any]]
+Mesh = tuple[AnyArray, AnyArray]
 """A triangle mesh: positions of V vertices (V, 3), and three vertex indices per triangle (F, 3)."""
 
 NO_MESH: Mesh = (np.zeros((3, 3)), np.array([[0, 1, 2]]))

@@ -19,7 +19,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from enum import IntEnum
-from typing import Any, ClassVar, TypeVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -433,7 +433,7 @@ def encode(frame: Frame, version: int = VERSION) -> bytes:
 def _check_array(
     name: str,
     value: object,
-    dtype: np.dtype[Any],
+    dtype: np.dtype[np.generic],
     shape: tuple[int, ...],
 ) -> AnyArray:
     """Return `value` if it is an array of this dtype and shape; otherwise raise ProtocolError.

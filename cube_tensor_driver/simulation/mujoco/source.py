@@ -31,6 +31,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -545,7 +546,7 @@ def _compute_field_of_polygons(
     )
 
 
-def _compute_curvatures(model: MjModel, mujoco: Any) -> Array:
+def _compute_curvatures(model: MjModel, mujoco: ModuleType) -> Array:
     """Return the curvature (geoms + 1,) of each geom (shape of a body) in 1/m.
 
     It is 1 / radius for spheres, capsules and cylinders, and 0 for all others. The last entry, 0,

@@ -4,10 +4,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from ...calibrate.fit import Fit
@@ -37,7 +37,7 @@ def draw_layout(layout: Layout) -> Figure:
     figure = Figure(figsize=(5, 4.6))
     # The code gives each part its drawing order (zorder). matplotlib would sort the parts by the
     # distance of their centres from the viewer, so that some visible parts would be hidden.
-    axes: Any = figure.add_subplot(projection="3d", computed_zorder=False)
+    axes: Axes3D = figure.add_subplot(projection="3d", computed_zorder=False)
     _draw_edges(axes)
     for name, centre, normal in zip(
         layout.pads,
@@ -69,7 +69,7 @@ def draw_layout(layout: Layout) -> Figure:
     return figure
 
 
-def _draw_edges(axes: Any) -> None:
+def _draw_edges(axes: Axes3D) -> None:
     """Draw the edges of a cube; the three edges at the corner that is hidden are dotted.
 
     Args:
@@ -84,7 +84,7 @@ def _draw_edges(axes: Any) -> None:
 
 
 def _draw_pad(
-    axes: Any,
+    axes: Axes3D,
     name: str,
     centre: Array,
     normal: Array,
@@ -148,7 +148,7 @@ def draw_fit(fit: Fit, measured: Array) -> Figure:
         is_used = ~fit.outliers[:, pad]
         x = fit.fitted[is_used, pad] * 1e-3
         y = measured[is_used, pad] * 1e-3
-        style: dict[str, Any] = {
+        style: dict[str, object] = {
             "marker": MARKERS[pad % len(MARKERS)],
             "color": str(0.7 * pad / max(1, len(pads) - 1)),
             "ls": "",
@@ -275,8 +275,8 @@ def draw_correction(
 
 
 def _draw_pads(
-    upper: Any,
-    lower: Any,
+    upper: Axes,
+    lower: Axes,
     minutes: Array,
     before: Array,
     after: Array,

@@ -4,8 +4,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ...core.arrays import Array
@@ -40,9 +39,7 @@ def draw_forces(
         cubes: (cubes, 3) positions of the cubes, in metres.
     """
     figure = Figure(figsize=(9, 5))
-    panels: Any = figure.subplot_mosaic(
-        [["force", "path"], ["centre", "path"]], width_ratios=[2.2, 1]
-    )
+    panels = figure.subplot_mosaic([["force", "path"], ["centre", "path"]], width_ratios=[2.2, 1])
     # The time axis begins at 0 with the first measurement.
     times = seconds - seconds.min()
     _draw_components(panels["force"], times, force, measured_force)
@@ -94,7 +91,7 @@ def draw_forces(
 
 
 def _draw_components(
-    panel: Any,
+    panel: Axes,
     times: Array,
     applied: Array,
     measured: Array,

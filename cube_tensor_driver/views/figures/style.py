@@ -81,7 +81,7 @@ def symbol(component: str) -> str:
     return rf"$\partial\sigma_{{{stress}}}/\partial {direction}$"
 
 
-def choose_curve_style(number: int) -> dict[str, Any]:
+def choose_curve_style(number: int) -> dict[str, object]:
     """Return the style of one curve as arguments of matplotlib's `plot`.
 
     Args:
