@@ -38,6 +38,8 @@ from .stored_messages import StoredMessages, join_in_blocks
 if TYPE_CHECKING:
     from rosbags.interfaces.typing import Fielddefs
 
+    from ..msg import SkinInfo
+
 MAX_DISORDER_NS = SECOND
 """Largest difference of stamps, in ns, by which messages and samples in a bag may be out of order.
 
@@ -415,7 +417,7 @@ class Bag:
             )
         self.skipped[topic] += count
 
-    def infos(self, topic: str) -> list[Any]:
+    def infos(self, topic: str) -> list[SkinInfo]:
         """Return the SkinInfo messages (cubes, calibrations, rest frequencies) of a topic.
 
         Messages that are damaged are left out.

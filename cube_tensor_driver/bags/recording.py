@@ -9,7 +9,7 @@ on. The health (which pads were left out as faulty) is in the recorded stress.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,6 +25,9 @@ from ..messages.types import INFO
 from .read import Bag, stamp_ns
 from .recorded_compensation import CompensationReader
 from .recorded_health import RecordedHealthReader
+
+if TYPE_CHECKING:
+    from ..msg import SkinInfo
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +65,7 @@ class Recording:
             BagError: The bag has no SkinInfo message for the topic, or one that is invalid.
         """
         self._bag = bag
-        self.infos: list[Any] = []
+        self.infos: list[SkinInfo] = []
         self.settings: list[Settings] = []
         for info in sorted(find_skin_infos(bag, topic), key=stamp_ns):
             try:
@@ -150,7 +153,7 @@ class Recording:
             )
 
 
-def find_skin_infos(bag: Bag, topic: str) -> list[Any]:
+def find_skin_infos(bag: Bag, topic: str) -> list[SkinInfo]:
     """Return the SkinInfo messages of the skin whose frequencies are on a topic.
 
     The messages of the reconstruction node are preferred, because they contain the rest frequencies
@@ -196,7 +199,7 @@ def reconstruct_rows(
     return reconstructor.process(rows, health)
 
 
-def read_settings(info: Any) -> Settings:
+def read_settings(info: SkinInfo) -> Settings:
     """Return the calibrations and rest frequencies in a SkinInfo message.
 
     Raises:
@@ -226,7 +229,7 @@ def read_settings(info: Any) -> Settings:
     return Settings(calibrations, pad_table(rest, widest, np.nan))
 
 
-def make_recorded_skin(info: Any, calibrations: tuple[Calibration, ...]) -> Skin:
+def make_recorded_skin(info: SkinInfo, calibrations: tuple[Calibration, ...]) -> Skin:
     """Return the skin that a SkinInfo message describes.
 
     Args:

@@ -15,9 +15,7 @@ from ..messages.codec import frequency_codec
 from .read import Bag
 
 if TYPE_CHECKING:
-    from rosbags.typesys.stores.ros2_jazzy import (
-        diagnostic_msgs__msg__DiagnosticStatus as DiagnosticStatus,
-    )
+    from diagnostic_msgs.msg import DiagnosticStatus
 
 DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 """Message type of the diagnostics, which state the condition of each node and cube."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,6 +26,9 @@ from ..messages.codec import SECOND
 from ..messages.types import STRESS as BATCH_TYPE
 from .fit import loads_from_forces
 from .load_table import Loads
+
+if TYPE_CHECKING:
+    from geometry_msgs.msg import Vector3
 
 WRENCH_TYPE = "geometry_msgs/msg/WrenchStamped"
 """ROS message type of a reference sensor that measures the force on the cube."""
@@ -336,7 +339,7 @@ def _read_batches(
     return rows.stamp_ns, rows.components.astype(float)
 
 
-def _find_axes(vector: Any) -> list[float]:
+def _find_axes(vector: Vector3) -> list[float]:
     """Return the numbers x, y, z of a Vector3 message."""
     return [vector.x, vector.y, vector.z]
 

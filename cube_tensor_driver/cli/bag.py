@@ -7,11 +7,13 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from .parser import Parser
 
 if TYPE_CHECKING:
+    from diagnostic_msgs.msg import DiagnosticStatus
+
     from ..bags.read import Bag
 
 
@@ -155,7 +157,7 @@ def show_skin(bag: Bag, topic: str) -> None:
     )
 
 
-def format_diagnostics(status: Any) -> str:
+def format_diagnostics(status: DiagnosticStatus) -> str:
     """Return one line for a diagnostic status: its name, its message, and all values except zeros.
 
     Args:

@@ -17,7 +17,7 @@ from ..core.errors import BagError
 from .plan import Episode
 
 if TYPE_CHECKING:
-    from rosbags.typesys.stores.ros2_jazzy import sensor_msgs__msg__Image as ImageMessage
+    from sensor_msgs.msg import Image as ImageMessage
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 """ROS message types that contain one image."""

@@ -25,7 +25,7 @@ from .images import IMAGE_TYPES, ImageStream, Shape
 from .plan import Choices, Episode
 
 if TYPE_CHECKING:
-    from rosbags.typesys.stores.ros2_jazzy import sensor_msgs__msg__JointState as JointState
+    from sensor_msgs.msg import JointState
 
 JOINT_STATE_TYPE = "sensor_msgs/msg/JointState"
 """Message type of joint states: names, positions, velocities and efforts of a robot's joints."""

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,12 +12,15 @@ from ..core.arrays import Array
 from ..core.compensation.motion import Motion
 from ..core.errors import MessageError
 
+if TYPE_CHECKING:
+    from ..msg import SkinCompensation
+
 STATES = ("creep", "thermal")
 """Names of those fields of SkinCompensation.msg that contain the state of a compensated effect
 (viscoelastic creep; temperature of the elastomer)."""
 
 
-def read_motion(message: Any, stamp_ns: int) -> Motion | None:
+def read_motion(message: SkinCompensation, stamp_ns: int) -> Motion | None:
     """Return the specific force over time that a SkinCompensation message contains.
 
     It is None if the weight of the elastomer is not compensated.
@@ -48,7 +51,7 @@ def read_motion(message: Any, stamp_ns: int) -> Motion | None:
         ) from None
 
 
-def read_states(message: Any) -> dict[str, Array]:
+def read_states(message: SkinCompensation) -> dict[str, Array]:
     """Return the states of effects in a SkinCompensation message, by their names in `STATES`.
 
     States that are empty in the message are left out.

@@ -10,7 +10,7 @@ library.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,6 +21,12 @@ from ..touch.surface import Contact
 from ..touch.tracker.contact_tracker import TrackedContact
 from .point_cloud import MakeMessage, make_cloud_message, make_header
 from .types import CONTACTS
+
+if TYPE_CHECKING:
+    from geometry_msgs.msg import Point, Vector3
+    from sensor_msgs.msg import PointCloud2
+
+    from ..msg import SkinContacts
 
 CLOUD = ("x", "y", "z", "pressure", "shear", "sigma")
 """Names of the fields of each point of the topic `traction`, all float32: position x, y, z in the
@@ -114,7 +120,7 @@ def make_traction_message(
     )
 
 
-def decode_contacts(message: Any) -> list[Contact]:
+def decode_contacts(message: SkinContacts) -> list[Contact]:
     """Return the contacts of a SkinContacts message.
 
     Values that only tracked contacts have are left out, except those for `slips` and `is_coarse`.
@@ -123,7 +129,7 @@ def decode_contacts(message: Any) -> list[Contact]:
         ValueError: The arrays of the message have different lengths.
     """
 
-    def read_xyz(vector: Any) -> Array:
+    def read_xyz(vector: Point | Vector3) -> Array:
         return np.array([vector.x, vector.y, vector.z])
 
     columns = [getattr(message, name) for name in (*_VECTORS, *_NUMBERS)]
@@ -141,7 +147,7 @@ def decode_contacts(message: Any) -> list[Contact]:
     ]
 
 
-def decode_traction(message: Any) -> Array:
+def decode_traction(message: PointCloud2) -> Array:
     """Return the points (M, 6), with the columns of `CLOUD`, of a message of the topic `traction`.
 
     Raises:

@@ -8,7 +8,7 @@ The message may be an object of rclpy or of the bag library.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,8 +19,11 @@ from ..core.errors import CalibrationError, ConfigError, MessageError
 from ..core.poses import CubePoses
 from ..core.tensor import rotation_from_quaternion
 
+if TYPE_CHECKING:
+    from ..msg import SkinInfo
 
-def read_cube_poses(info: Any) -> CubePoses:
+
+def read_cube_poses(info: SkinInfo) -> CubePoses:
     """Return the poses (in the skin's parent frame) and half sides of the cubes, in m.
 
     Args:
@@ -60,7 +63,7 @@ def read_cube_poses(info: Any) -> CubePoses:
     return poses
 
 
-def read_cube_calibrations(info: Any) -> tuple[Calibration, ...]:
+def read_cube_calibrations(info: SkinInfo) -> tuple[Calibration, ...]:
     """Return the calibration of each cube. Cubes with the same calibration id share one object.
 
     Args:
@@ -101,7 +104,7 @@ def _parse_calibration(name: str, text: str) -> Calibration:
     return Calibration.from_dict(parse_yaml(text, f"calibration {name}"))
 
 
-def read_skin_elastomer(info: Any) -> Elastomer | None:
+def read_skin_elastomer(info: SkinInfo) -> Elastomer | None:
     """Return the elastomer around the cubes; None if the skin file does not describe it.
 
     Args:
@@ -113,7 +116,7 @@ def read_skin_elastomer(info: Any) -> Elastomer | None:
     return Elastomer(*numbers)
 
 
-def geometry(info: Any) -> list[object]:
+def geometry(info: SkinInfo) -> list[object]:
     """Return the parts of a SkinInfo message that describe the geometry of the skin.
 
     They are the coordinate frame, the elastomer, and the name, pose and half side of each cube. If

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 from ...core.arrays import Times
 from ...core.errors import BagError
@@ -24,6 +24,9 @@ from ...touch.contact_finder import ContactFinder, ContactSettings, contact_find
 from ..metadata import quality
 from ..read import make_message, serialise
 from ..write import BagWriter
+
+if TYPE_CHECKING:
+    from ...msg import SkinInfo
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,7 @@ class ContactWriter:
         self._frame_id = ""
         self._last_ns: int | None = None
 
-    def set_up(self, info: Any) -> None:
+    def set_up(self, info: SkinInfo) -> None:
         """Use a SkinInfo message (poses and calibrations of the cubes) for the stress that follows.
 
         If the frame, the elastomer, and the names, poses and sizes of the cubes are the same as in

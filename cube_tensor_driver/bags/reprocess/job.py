@@ -12,7 +12,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -35,6 +35,7 @@ from ..tables import BufferedTable, TableWriter, report_write_errors
 from ..write import BagWriter
 
 if TYPE_CHECKING:
+    from ...msg import SkinInfo
     from .contacts import ContactOptions
 
 PARTIAL_PREFIX = ".partial-"
@@ -307,7 +308,7 @@ def _write_skin(
 
 def _recalibrate(
     source: BagSource,
-    info: Any,
+    info: SkinInfo,
     recorded: Settings,
     overrides: Overrides,
 ) -> Settings:
@@ -432,9 +433,9 @@ def _measure_rest(
 
 
 def _replace_settings(
-    infos: list[Any],
+    infos: list[SkinInfo],
     settings: list[Settings],
-) -> Iterator[Any]:
+) -> Iterator[SkinInfo]:
     """Yield the recorded SkinInfo messages with replaced calibrations and rest frequencies.
 
     A rest frequency is the frequency of a pad without load.
