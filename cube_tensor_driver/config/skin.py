@@ -392,7 +392,7 @@ def _read_cubes(
 
 def _find_contradictions(
     cube: SkinCube,
-    item: dict[str, Any],
+    item: dict[str, object],
     links: list[str] | None,
 ) -> Iterator[str]:
     """Yield a mistake for each key of a cube that contradicts another key or the calibration.

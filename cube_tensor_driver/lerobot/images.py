@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
@@ -17,6 +17,7 @@ from ..core.errors import BagError
 from .plan import Episode
 
 if TYPE_CHECKING:
+    from sensor_msgs.msg import CompressedImage
     from sensor_msgs.msg import Image as ImageMessage
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -127,12 +128,12 @@ class ImageStream:
                 self._fail(f"an image of {shape} after ones of {self.shape}")
         return self._latest
 
-    def _read(self) -> Iterator[tuple[int, Any]]:
+    def _read(self) -> Iterator[tuple[int, ImageMessage | CompressedImage]]:
         """Yield the stamp, in ns since the Unix epoch, and the message of each image."""
         for _, message in self._bag.decoded({self._topic}):
             yield stamp_ns(message), message
 
-    def _encode(self, message: Any) -> tuple[bytes, Shape]:
+    def _encode(self, message: ImageMessage | CompressedImage) -> tuple[bytes, Shape]:
         """Convert an Image or CompressedImage message to an image file, such as PNG or JPEG.
 
         Returns:
