@@ -183,7 +183,12 @@ class BagWriter:
             )
         # The file contains the type's definition, so that the bag can be read without this package.
         definition, _ = store.generate_msgdef(msgtype, ros_version=2)
-        one = Connection(topic, msgtype, definition, list(qos))
+        one = Connection(
+            topic,
+            msgtype,
+            definition,
+            list(qos),
+        )
         self._topics.append(one)  # each storage file that begins later gets the topic, too
         with self._report_failure():
             self._connect(self._open_part(), one)

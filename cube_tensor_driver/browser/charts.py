@@ -173,7 +173,12 @@ class Charts:
         for number, one in enumerate(self.lists):
             # A browser may send any text, so the value is checked.
             group = one.value if one.value in GROUPS else FIRST_GROUPS[0]
-            chart = make_chart(history, self._names, self._cubes, group)
+            chart = make_chart(
+                history,
+                self._names,
+                self._cubes,
+                group,
+            )
             # A chart without lines would have no axes, so the last one with lines is kept.
             if chart.lines:
                 self._charts[number] = chart

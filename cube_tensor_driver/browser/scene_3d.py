@@ -440,7 +440,14 @@ class Scene:
             radius = max(radius_m * placement.unit, MIN_RING)
             # The ring lies in the plane of the drawn field, so that it encloses the load there.
             centre = placement.point(contact.position) - self._contact_depth * contact.normal
-            rings.append(scene.ring(centre, contact.normal, radius, RING_CORNERS))
+            rings.append(
+                scene.ring(
+                    centre,
+                    contact.normal,
+                    radius,
+                    RING_CORNERS,
+                )
+            )
         return np.concatenate(rings)
 
     def _add_scale_bar(self, api: viser.SceneApi) -> None:

@@ -132,7 +132,12 @@ class Viewer:
             (PointCloud2, "traction", self._receive_traction),
         ):
             receive_safely = self._callback_errors.catch(receive)
-            node.create_subscription(kind, topic, receive_safely, 10)
+            node.create_subscription(
+                kind,
+                topic,
+                receive_safely,
+                10,
+            )
         self._status = PageStatus()
         self._services = ServiceCalls(self._status.say)
         self._replay = ReplayClient(node, self._services, self._status.say)

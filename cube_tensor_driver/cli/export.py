@@ -113,7 +113,12 @@ def run(options: argparse.Namespace) -> int:
     options.overrides = reprocess.read_overrides(options)
     choices = Choices(**{field.name: getattr(options, field.name) for field in fields(Choices)})
     with progress_bar() as report:
-        exported = export_lerobot(options.bags, options.output, choices, report)
+        exported = export_lerobot(
+            options.bags,
+            options.output,
+            choices,
+            report,
+        )
     show_exported(options.output, exported)
     return 0
 

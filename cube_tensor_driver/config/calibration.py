@@ -26,7 +26,12 @@ def find_calibration(name: str, folder: Path) -> Path:
         ConfigError: The package has no calibration of this name and the path leads to no file.
     """
     advice = "a file, or one of the shipped calibrations"
-    return find_shipped("calibration/*.yaml", name, folder, advice)
+    return find_shipped(
+        "calibration/*.yaml",
+        name,
+        folder,
+        advice,
+    )
 
 
 def read_calibration(path: Path) -> Calibration:

@@ -27,7 +27,12 @@ def find_influence(name: str) -> Path:
         "a file of influence functions that ./cube fem MODEL --surface -o FILE.npz made, or one of "
         "the shipped"
     )
-    return find_shipped("influence/*.npz", name, Path(), advice)
+    return find_shipped(
+        "influence/*.npz",
+        name,
+        Path(),
+        advice,
+    )
 
 
 def find_influence_problem(name: str) -> str:

@@ -263,7 +263,12 @@ class Reconstructor:
             raise TareError("tare of no cube; name one, or leave the list out for all")
         self._check_cubes(cubes)
         present = self.rest_frequency
-        measured = measure_rest(self.health, cubes, duration, self.names)
+        measured = measure_rest(
+            self.health,
+            cubes,
+            duration,
+            self.names,
+        )
         # The compensation of creep hides a part of a constant error of the rest frequencies, so
         # the measured difference is smaller than the error.
         visible_share = self.compensation.creep.find_visible_share()

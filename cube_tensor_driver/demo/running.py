@@ -106,7 +106,12 @@ class Observer:
                 self.children.check()
             self.on_step()
 
-        spin_until(self.executor, done, seconds, on_step=check)
+        spin_until(
+            self.executor,
+            done,
+            seconds,
+            on_step=check,
+        )
 
 
 @contextmanager

@@ -398,7 +398,12 @@ class PolygonTables(_ContactTables):
             ],
             axis=-1,
         )
-        return self._sum_loads(weights, rows, loads, direction)
+        return self._sum_loads(
+            weights,
+            rows,
+            loads,
+            direction,
+        )
 
 
 def _to_complex(vectors: Array) -> Complex:

@@ -161,7 +161,12 @@ class Spectra:
             bessel,
             prior,
         )
-        direct = self._integrate(of_direct, order + other.order, bessel, prior)
+        direct = self._integrate(
+            of_direct,
+            order + other.order,
+            bessel,
+            prior,
+        )
 
         # The covariances of real and imaginary parts follow from those of the complex components:
         # Re c Re d = Re(c d* + c d) / 2 and Im c Im d = Re(c d* - c d) / 2.

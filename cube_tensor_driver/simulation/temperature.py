@@ -71,7 +71,14 @@ def read_thermal_stress(name: str, n_pads: int) -> ThermalLayer:
         ConfigError: There is no such file, or it has another number of pads.
     """
     advice = "a file of ./cube fem --temperature"
-    data = read_yaml(find_shipped("thermal/*.yaml", name, Path(), advice))
+    data = read_yaml(
+        find_shipped(
+            "thermal/*.yaml",
+            name,
+            Path(),
+            advice,
+        )
+    )
     try:
         pads = np.array(data["pads"], float)
         layer = ThermalLayer(

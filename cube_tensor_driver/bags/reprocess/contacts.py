@@ -172,5 +172,10 @@ class ContactWriter:
         self._writer.write(self._contacts, recorded_ns, serialise(message))
         cloud = finder.cloud(values) if is_due else None
         if cloud is not None:
-            message = make_traction_message(make_message, stamp_ns, self._frame_id, cloud)
+            message = make_traction_message(
+                make_message,
+                stamp_ns,
+                self._frame_id,
+                cloud,
+            )
             self._writer.write(self._traction, recorded_ns, serialise(message))

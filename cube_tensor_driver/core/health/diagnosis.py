@@ -219,7 +219,12 @@ class PadDiagnosis:
         with np.errstate(invalid="ignore"):  # NaN where a cube has no such pad, or no rows
             found[self._find_noisy(window, state)] |= NOISY
             found[self._find_stuck(span, state)] |= STUCK
-            self._update_still(window, span, has_enough_rows, state)
+            self._update_still(
+                window,
+                span,
+                has_enough_rows,
+                state,
+            )
             found[self._find_drifting(window)] |= DRIFT
         is_valid = has_enough_rows[:, None] & self._exists
         return found * is_valid

@@ -219,7 +219,12 @@ class _Listener:
             self._needs_names = True
             namespace = self._topic.rpartition("/")[0]
             info = f"{namespace}/info"
-            self._node.create_subscription(SkinInfo, info, self._on_info, LATCHED)
+            self._node.create_subscription(
+                SkinInfo,
+                info,
+                self._on_info,
+                LATCHED,
+            )
             self._node.create_subscription(
                 kind,
                 self._topic,
@@ -228,7 +233,12 @@ class _Listener:
                 raw=True,
             )
         else:
-            self._node.create_subscription(kind, self._topic, self._on_message, profile)
+            self._node.create_subscription(
+                kind,
+                self._topic,
+                self._on_message,
+                profile,
+            )
 
     def take(self) -> list[Item]:
         """Remove the oldest message from `waiting`, and return its content.

@@ -281,7 +281,12 @@ def record(
     stop = stop_event()
     with node_session("recorder") as session:
         names = resolve_topics(session.node, topics)
-        bag = BagWriter(folder, storage, max_bytes, max_seconds)
+        bag = BagWriter(
+            folder,
+            storage,
+            max_bytes,
+            max_seconds,
+        )
         recorder = Recorder(session.node, names, bag)
         begin = find_at = show_at = time.monotonic()
         until = float("inf") if duration is None else begin + duration

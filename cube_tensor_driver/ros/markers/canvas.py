@@ -132,7 +132,12 @@ class Canvas:
         if self._has_crosses:
             shapes.append(self._draw_crosses(values, ranges.traction))
         shapes += self._draw_contacts(contacts)
-        shapes += draw_legend(self._legend_place, quantity, ranges, health)
+        shapes += draw_legend(
+            self._legend_place,
+            quantity,
+            ranges,
+            health,
+        )
         return serialise(self._frame_id, shapes)
 
     def _draw_arrows(self, values: Array, ranges: scene.Ranges) -> list[Shape]:
@@ -212,7 +217,12 @@ class Canvas:
             # drawn.
             area = max(0.0, contacts.area[number])
             radius = float(np.sqrt(area / np.pi))
-            rings[number] = scene.ring(position, normal, radius, RING_CORNERS)
+            rings[number] = scene.ring(
+                position,
+                normal,
+                radius,
+                RING_CORNERS,
+            )
             # The arrays of slip and fits are empty for contacts that were found by interpolation.
             has_slip = number < len(contacts.slip)
             slips = has_slip and contacts.slip[number] == SkinContacts.SLIP

@@ -78,7 +78,12 @@ class StressPublisher:
         self._buffer = lru_cache(maxsize=MAX_BUFFERS)(stress_codec.buffer)
         self._publisher = node.own(node.create_lifecycle_publisher(SkinStress, "stress", profile))
         forces = Forces(skin, side)
-        self._cubes = CubeTopics(node, skin, reconstructor, forces.side)
+        self._cubes = CubeTopics(
+            node,
+            skin,
+            reconstructor,
+            forces.side,
+        )
         self._forces = ForceCloud(node, skin, profile, forces) if with_forces else None
         node.own(node.create_timer(LISTENERS_PERIOD_S, self._cubes.find_listeners))
 
@@ -174,8 +179,18 @@ class CubeTopics:
         self._skin = skin
         self._reconstructor = reconstructor
         self._sides = sides
-        self._tensors = _CubePublishers(node, skin, "stress", StressTensorStamped)
-        self._wrenches = _CubePublishers(node, skin, "wrench", WrenchStamped)
+        self._tensors = _CubePublishers(
+            node,
+            skin,
+            "stress",
+            StressTensorStamped,
+        )
+        self._wrenches = _CubePublishers(
+            node,
+            skin,
+            "wrench",
+            WrenchStamped,
+        )
 
     def find_listeners(self) -> None:
         """Update the lists of cubes whose topics have subscribers. A timer calls this method."""
