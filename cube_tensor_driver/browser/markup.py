@@ -280,9 +280,9 @@ def numbers(scan: Scan, cube: int, above: Array | None) -> str:
         rows.append(("on the surface", f"{pressure:.2f} ± {deviation:.2f}", "kPa"))
     rows.append(("residual", f"{scan.residual[cube]:.2f}", "× noise"))
     rows.append(("rate", f"{scan.rate[cube]:.0f}", "Hz"))
-    rows.append(
-        ("state", describe_status(scan.status[cube]) or HEALTH_WORDS[scan.health[cube]], "")
-    )
+    status = describe_status(scan.status[cube])
+    state = status or HEALTH_WORDS[scan.health[cube]]
+    rows.append(("state", state, ""))
     return box(_make_table(rows))
 
 

@@ -166,8 +166,11 @@ def _list_options(
     ]
     if scan.field.sigma is not None or settings.quantity is DEVIATION:
         quantities.append(DEVIATION.label)
-    groups = tuple(group for group, names in GROUPS.items() if observed.intersection(names))
+    groups = []
+    for group, names in GROUPS.items():
+        if observed.intersection(names):
+            groups.append(group)
     update: Update = {"colour": {"options": tuple(quantities)}}
     for number in range(len(settings.charts)):
-        update[f"chart list {number}"] = {"options": groups}
+        update[f"chart list {number}"] = {"options": tuple(groups)}
     return update

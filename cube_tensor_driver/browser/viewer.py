@@ -237,7 +237,8 @@ class Viewer:
             client: The browser.
         """
         # The event waited in the queue, and the browser may have disconnected in that time.
-        if client.client_id in self._pages or client.client_id not in self._server.get_clients():
+        has_page = client.client_id in self._pages
+        if has_page or client.client_id not in self._server.get_clients():
             return
         # The size is read before panels are added, because they make the picture narrower.
         size = client.camera.image_width, client.camera.image_height

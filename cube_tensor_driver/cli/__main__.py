@@ -27,7 +27,8 @@ if __name__ == "__main__":
         # Python flushes stdout again at its exit, so stdout is redirected to avoid a second error.
         if error.errno not in (errno.EPIPE, errno.ENOSPC):
             raise
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
         code = 1
         if error.errno == errno.EPIPE:
             # The reader has closed the pipe, as in ./cube urdf skin.yaml | head.

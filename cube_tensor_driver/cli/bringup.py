@@ -266,7 +266,8 @@ def press_cubes(source: LinkSource, rest: PadsAtRest) -> dict[int, Explanation]:
         """
         while True:
             say(f"press the skin next to {where}, and hold")
-            press = next(each for each in map(detector.update, means) if each is not None)
+            presses = map(detector.update, means)
+            press = next(each for each in presses if each is not None)
             say(f"{cubes[press.cube].name} answers: let go")
             while detector.is_held:
                 detector.update(next(means))

@@ -75,6 +75,6 @@ def run(options: argparse.Namespace) -> int:
     if options.duration is None and measures:
         options.duration = DEFAULT_DURATION_S
     # Each field of DemoSettings has the value of the option with the same name.
-    return run_demo(
-        DemoSettings(**{field.name: getattr(options, field.name) for field in fields(DemoSettings)})
-    )
+    names = [field.name for field in fields(DemoSettings)]
+    settings = {name: getattr(options, name) for name in names}
+    return run_demo(DemoSettings(**settings))

@@ -111,7 +111,8 @@ def run(options: argparse.Namespace) -> int:
     # All bags become one data set with the same choices. Each field of `Choices` has the value of
     # the option with the same name.
     options.overrides = reprocess.read_overrides(options)
-    choices = Choices(**{field.name: getattr(options, field.name) for field in fields(Choices)})
+    names = [field.name for field in fields(Choices)]
+    choices = Choices(**{name: getattr(options, name) for name in names})
     with progress_bar() as report:
         exported = export_lerobot(
             options.bags,

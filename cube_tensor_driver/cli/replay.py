@@ -134,7 +134,8 @@ def single_keys() -> Iterator[bool]:
 
 def read_pressed_key() -> str:
     """Return the character of the next key that was pressed, or an empty text if there is none."""
-    if not select.select([sys.stdin], [], [], 0)[0]:
+    readable, _, _ = select.select([sys.stdin], [], [], 0)
+    if not readable:
         return ""
     # sys.stdin.read would move further keys into its own buffer, where `select` does not find them.
     return os.read(sys.stdin.fileno(), 1).decode(errors="replace")

@@ -69,11 +69,15 @@ def describe_grid(
         first_of_link = -(-link * n_cubes // links)  # number of its first cube, rounded up
         x = (number % nx - (nx - 1) / 2) * pitch
         y = (number // nx - (ny - 1) / 2) * pitch
+        pose = {
+            "xyz": [round(x, 9), round(y, 9), 0.0],
+            "rpy": [0.0, 0.0, 0.0],
+        }
         cube = {
             "name": f"c{number:0{digits}d}",
             "link": f"hub{link}",
             "index": number - first_of_link,
-            "pose": {"xyz": [round(x, 9), round(y, 9), 0.0], "rpy": [0.0, 0.0, 0.0]},
+            "pose": pose,
             "layout": layout,
             "calibration": calibration or layout,
         }

@@ -283,7 +283,9 @@ def check_skin_data(
     if not isinstance(data, dict):
         return None, mistakes
     # Further checks go through the entries of both lists, so both must be lists.
-    if not isinstance(data.get("links"), list) or not isinstance(data.get("cubes"), list):
+    has_links = isinstance(data.get("links"), list)
+    has_cubes = isinstance(data.get("cubes"), list)
+    if not has_links or not has_cubes:
         return None, mistakes
     # The first two keys on the path to a mistake identify the entry of a link or a cube, as in
     # ("cubes", 3, "pose").

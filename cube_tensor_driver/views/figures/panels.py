@@ -42,7 +42,13 @@ def draw_panels(
         panels: The panels, from top to bottom; a line that is NaN everywhere is left out.
     """
     figure = Figure(figsize=(8, 2.5 * len(panels)))
-    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    grid = figure.subplots(
+        len(panels),
+        1,
+        sharex=True,
+        squeeze=False,
+    )
+    axes = grid[:, 0]
     steps = np.diff(times)
     usual_step = float(np.median(steps)) if len(steps) else 0.0
     gaps = 1 + np.flatnonzero(steps > MIN_GAP_STEPS * usual_step)
