@@ -205,7 +205,8 @@ class LiveWindows:
             rows,
         )
         arrays = {name: as_column(values) for name, values in columns.items()}
-        batch = pyarrow.record_batch({NUMBER_COLUMN: pyarrow.array([self._number])} | arrays)
+        number = pyarrow.array([self._number])
+        batch = pyarrow.record_batch({NUMBER_COLUMN: number} | arrays)
         if self._writer is None:
             path = self._folder / f"{self._number}.arrow"
             self._writer = pyarrow.ipc.new_stream(str(path), batch.schema)

@@ -400,7 +400,9 @@ def _find_marked_spans(
         raise BagError(
             f"{bag.path}: no marks ({MARK_TYPE}) on {topic}; topics of that type: {names}"
         )
-    marks = [(time_ns, mark.data.strip()) for time_ns, mark in bag.decoded({topic})]
+    marks = []
+    for time_ns, mark in bag.decoded({topic}):
+        marks.append((time_ns, mark.data.strip()))
     end = (MAX_TIME_NS, "")
     spans = []
     for (since_ns, task), (until_ns, _) in pairwise([*marks, end]):

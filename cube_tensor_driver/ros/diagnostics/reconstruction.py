@@ -273,7 +273,8 @@ class CubeHealth:
             health.sums.pads("last")[cubes],
             temperature=health.temperature[cubes],
         )
-        is_suspect = self._pipeline.suspects(newest, health.sums.cubes["mask"][cubes])
+        left_out = health.sums.cubes["mask"][cubes]
+        is_suspect = self._pipeline.suspects(newest, left_out)
         names = {}
         for cube, suspects in zip(cubes.tolist(), is_suspect, strict=True):
             pads = self._skin.cubes[cube].calibration.layout.pads

@@ -524,7 +524,8 @@ def _compute_field_of_polygons(
     # Each corner is the start of one edge, the next corner its end.
     starts = np.concatenate(corners)
     ends = np.concatenate([next_corners(one) for one in corners])
-    number = np.repeat(np.arange(len(polygons)), [len(one) for one in corners])
+    n_corners = [len(one) for one in corners]
+    number = np.repeat(np.arange(len(polygons)), n_corners)
 
     origin = position[:, None]
     centre = (np.array(centres) - origin) @ in_plane
