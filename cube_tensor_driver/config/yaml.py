@@ -48,7 +48,7 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
         self,
         node: yaml.MappingNode,
         deep: bool = False,
-    ) -> dict[Any, Any]:
+    ) -> dict[object, object]:
         # A mapping may override keys that "<<" copies from another mapping. Therefore its own keys
         # are listed now, before PyYAML inserts the copied ones into the node.
         own_keys = [key for key, _ in node.value if key.tag != _MERGE_TAG]

@@ -404,7 +404,7 @@ def illustrative(
 
 
 def _check_keys(
-    data: Mapping[str, Any],
+    data: Mapping[str, object],
     attributes: set[str],
 ) -> None:
     """Raise CalibrationError if keys are missing or unknown, or the schema is not `SCHEMA`.
