@@ -108,8 +108,9 @@ class PageReader(threading.Thread):
             self._objects.setdefault(name, {}).update(resolved)
             changed = changed or message["type"] == "GuiUpdateMessage"
         if changed:
-            self.windows.append(len(decoded["messages"]))
             self._read_state()
+        if self.states:  # The messages that build the page may fill a window.
+            self.windows.append(len(decoded["messages"]))
 
     def _read_state(self) -> None:
         """Everything that depends on the scan, as numbers of the scan or in SI units."""
