@@ -77,9 +77,11 @@ _LETTERS = {
 pad to it. The names are the letters of Kiyota & Shinoda (eq. 1), who call this pad V1. The mode zx
 has equal stresses sigma_zx and sigma_xz, so its response is c + d."""
 _PAPER_LETTERS = _LETTERS | {"zx": ("c", -1), "xz": ("d", -1)}
-"""The same table as `_LETTERS` (names and signs of the coefficients of the first pad, by mode) for
-the modes of Kiyota & Shinoda. They treat the shear stresses sigma_zx and sigma_xz as independent,
-so each of the two has a coefficient of its own."""
+"""Name and sign of the coefficient of the first pad in each mode of Kiyota & Shinoda.
+
+Unlike in `_LETTERS`, the shear stresses sigma_zx and sigma_xz are independent there, and each has a
+coefficient of its own.
+"""
 
 
 def generate_group(generators: Sequence[Matrix]) -> Index:

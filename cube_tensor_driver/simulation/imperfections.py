@@ -17,7 +17,7 @@ power law is an integral over Kelvin-Voigt elements of all time constants tau::
 
     t^alpha = alpha / Gamma(1 - alpha) * integral of (1 - exp(-t / tau)) tau^(alpha - 1) dtau
 
-so it is simulated as a sum over so many time constants that the error of the sum is negligible. The
+The simulation replaces the integral by a sum over many time constants, with a negligible error. The
 silicone around the cubes needs no creep terms: if its Poisson's ratio does not change, the stress
 in a viscoelastic body under given tractions is that of the elastic body (correspondence principle).
 The growth of contacts as silicone creeps is not modelled.

@@ -30,7 +30,7 @@ change smoothly where a slide reverses its direction."""
 
 MAX_RADIUS_DEPTHS = 12
 """Largest allowed radius of a contact, divided by the depth of the cubes' centres. Larger contacts
-would need so many point forces that computing their stress takes minutes."""
+need more point forces, and computing their stress would take minutes."""
 
 MAX_CACHED_BYTES = 64 << 20
 """Maximum memory, in bytes, of the stress fields that `LoadMemory` keeps for a repeated load."""

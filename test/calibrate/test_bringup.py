@@ -46,19 +46,21 @@ def test_statistics_at_rest_give_back_what_was_put_in():
     random = np.random.default_rng(1)
     seconds = 0.001 * np.arange(10_000)
     frequency = np.tile([1e5, 2e5, 1.5e5, 1.2e5, 1.1e5], (10_000, 2, 1))
-    noise = np.array([5e-6, 10e-6, 5e-6, 5e-6, 800e-6])
+    # The median of those that vary is 7.5e-6 in both cubes, so the last pads stand 7 % above and
+    # below ten times the median.
+    noise = 1e-6 * np.array([[5, 10, 5, 5, 80], [5, 10, 5, 5, 70]])
     frequency *= 1 + noise * random.standard_normal(frequency.shape)
     frequency[:, :, 1] *= 1 + 300e-6 / 60 * seconds[:, None]
     frequency[:, 0, 2] = 1.5e5
     frequency[:, 1, 3] = np.nan
     found = measure_pads_at_rest(frequency, seconds)
     # The standard error of a noise from 10,000 second differences is 1 %.
-    np.testing.assert_allclose(found.noise[0, [0, 1, 3]], noise[[0, 1, 3]], rtol=0.04)
+    np.testing.assert_allclose(found.noise[0, [0, 1, 3]], noise[0, [0, 1, 3]], rtol=0.04)
     # That of a slope over 10 s is sqrt(12 / 10,000) noise / 10 s, here 2 ppm a minute.
     assert found.drift[0, 1] == pytest.approx(300e-6, abs=8e-6)
     assert np.argwhere(found.stuck).tolist() == [[0, 2]]
     assert np.argwhere(found.silent).tolist() == [[1, 3]]
-    assert np.argwhere(found.noisy).tolist() == [[0, 4], [1, 4]]
+    assert np.argwhere(found.noisy).tolist() == [[0, 4]]
 
 
 def test_a_press_is_read_once_and_only_when_it_is_steady():

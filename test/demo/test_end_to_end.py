@@ -52,11 +52,6 @@ SKIN = package_data() / "config" / "skin_demo.yaml"
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-def row_numbers(message: SkinStress | SkinFrequencies) -> tuple[tuple[int, int], ...]:
-    """Cube and number of each row: two hubs count alike, and may come in messages of their own."""
-    return tuple(zip(message.cube, message.sequence, strict=True))
-
-
 def demo(*arguments: str) -> subprocess.Popen:
     return subprocess.Popen(
         [sys.executable, "-m", "cube_tensor_driver.cli", "demo", *arguments],

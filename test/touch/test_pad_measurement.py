@@ -34,8 +34,11 @@ PLANAR, CUBE = (find_shipped_calibration(LAYOUTS[name]) for name in ("planar", "
 SCALE = 2e-3
 UNITS = np.where(np.arange(len(COMPONENTS)) < len(STRESS), 1.0, SCALE)
 LEFT_OUT = 0.015
-"""Of the largest value: components whose singular values are below a thousandth add up, most for
-narrow contacts."""
+"""Largest error of a response, divided by its largest value.
+
+The influence functions leave out components with small singular values (below a thousandth of the
+largest), and these errors add up. They are largest for narrow contacts.
+"""
 
 
 @pytest.fixture(scope="module")

@@ -59,9 +59,9 @@ class CubeNoise:
     def update(self, scaled: Array, cubes: Index) -> None:
         """Compute the noise of cubes again if it has changed.
 
-        It is computed for cubes whose pads in use or known components (not NaN) have changed since
-        the last update, or whose stress has changed so much that the variance of a pad's error has
-        changed by more than the factor `MAX_NOISE_CHANGE`.
+        The noise of a cube has changed if other pads are in use or other components are known (not
+        NaN) than at the last update. It has also changed if its stress makes the variance of a
+        pad's error differ by more than the factor `MAX_NOISE_CHANGE`.
 
         Args:
             scaled: Components of stress and gradient (times d0, half the side of a cube), in Pa
