@@ -118,7 +118,8 @@ class Transforms:
             found = self._buffer.lookup_transform(target, source, Time())
         except self._error as error:
             raise MissingMotion(
-                f"no transform from {source} to {target}: {error}; publish it on /tf or /tf_static"
+                f"no transform from {source} to {target}: {str(error).rstrip(' .')}; publish it "
+                "on /tf or /tf_static"
             ) from None
         p = found.transform.translation
         q = found.transform.rotation
@@ -160,9 +161,11 @@ class GravityMotion:
         rotation, _, time_ns = self._transforms.newest(self._parent_frame, self._frame)
         age_ns = last_ns - time_ns
         if time_ns and abs(age_ns) > MAX_TRANSFORM_AGE_NS:
+            side = "older" if age_ns > 0 else "newer"
             raise MissingMotion(
-                f"transform from {self._frame} to {self._parent_frame} is {age_ns / 1e9:.1f} s "
-                "older than the rows: see who publishes it, and that clocks agree"
+                f"transform from {self._frame} to {self._parent_frame} is "
+                f"{abs(age_ns) / 1e9:.1f} s {side} than the rows: see who publishes it, and that "
+                "clocks agree"
             )
         up = STANDARD_GRAVITY * rotation[:, 2]
         no_rotation = np.zeros((1, 3, 3))
@@ -189,16 +192,17 @@ class _Sample(NamedTuple):
         time_ns: Time of the sample, in ns since the Unix epoch.
         specific_force: Specific force (acceleration minus gravity), in m/s².
         angular_velocity: Angular velocity, in rad/s.
-        angular_acceleration: Angular acceleration, in rad/s².
-        mean_acceleration: Mean angular acceleration since the sample before, in rad/s²; 0 if there
-            is none.
+        angular_acceleration: Angular acceleration, in rad/s²; NaN if there was no sample shortly
+            before, from whose angular velocity it follows.
+        mean_acceleration: Mean angular acceleration since the sample before, in rad/s²; None if
+            there was none shortly before.
     """
 
     time_ns: int
     specific_force: Vector
     angular_velocity: Vector
-    angular_acceleration: Vector = (0.0, 0.0, 0.0)
-    mean_acceleration: Vector = (0.0, 0.0, 0.0)
+    angular_acceleration: Vector = (math.nan,) * 3
+    mean_acceleration: Vector | None = None
 
 
 class ImuMotion:
@@ -263,7 +267,7 @@ class ImuMotion:
             # The mean angular acceleration is taken as that in the middle of the interval between
             # the samples. It is extrapolated linearly to the end of the interval, the time of the
             # new sample.
-            means = zip(mean, before.mean_acceleration, strict=True)
+            means = zip(mean, before.mean_acceleration or mean, strict=True)
             acceleration = tuple(1.5 * now - 0.5 * then for now, then in means)
             sample = sample._replace(angular_acceleration=acceleration, mean_acceleration=mean)
         if len(self._samples) == MAX_SAMPLES:

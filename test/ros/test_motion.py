@@ -199,7 +199,8 @@ def fake_tf(monkeypatch, **frames) -> None:
     class Buffer:
         def lookup_transform(self, target, source, when):
             if source not in frames or target != "tool":
-                raise TransformException(f"{source} does not exist")
+                # tf2 ends this text with a space.
+                raise TransformException(f"{source} does not exist. ")
             (x, y, z, w), p, stamp_ns = frames[source]
             return SimpleNamespace(
                 transform=SimpleNamespace(
@@ -255,6 +256,22 @@ def test_a_shaken_arm_leaves_no_weight_and_no_contact(start, monkeypatch):
     assert np.abs(left).max() < 30
     off = Reconstructor([illustrative("planar")] * 2).process(rows)
     assert np.abs(off.stress[:, [0, 2, 4]]).max() > 200
+
+
+def test_rows_wait_for_the_second_sample_of_an_imu(start, monkeypatch):
+    """The first sample tells no angular acceleration, without which up to 80 Pa are left."""
+    fake_tf(monkeypatch, imu=IMU_FRAME)
+    node, moving = start(imu="/imu"), MovingSkin()
+    for k in range(3):
+        node._motion.on_imu(serialize_message(imu_message(moving, k * IMU_PERIOD_S)))
+    for t in (0.002, 0.006, 0.009):
+        node.on_rows(scan_at(t, moving))
+    first, *later = [stress_codec.decode(one).rows for one in node.sent["stress"]]
+    assert (first.status & (WEIGHT | COMPENSATION) == COMPENSATION).all()
+    later = concatenate(later)
+    assert (later.status & (WEIGHT | COMPENSATION) == WEIGHT).all()
+    # Measured: 2.2 Pa at most.
+    assert np.abs(later.stress[:, [0, 2, 4]]).max() < 10
 
 
 def write_lasting_effects(folder, ramp: float = 0.0) -> None:
@@ -438,6 +455,8 @@ def test_gravity_comes_from_tf_alone(start, monkeypatch):
     assert "transform from world to tool is 1.4 s older" in node._statuses()[0].message
     stress = [stress_codec.decode(one).rows for one in node.sent["stress"]]
     assert [rows.status[0] & (WEIGHT | COMPENSATION) for rows in stress] == [WEIGHT, COMPENSATION]
+    node.on_rows(scan_at(-49.9))
+    assert "transform from world to tool is 50.0 s newer" in node._statuses()[0].message
 
 
 def test_what_nobody_records_is_not_sent_but_compensated(start, monkeypatch):
