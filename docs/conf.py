@@ -12,7 +12,13 @@ from pathlib import Path
 
 from pygments.lexers.special import TextLexer
 
-from cube_tensor_driver.config.parameters import CONTACTS, DRIVER, MARKERS, RECONSTRUCTION
+from cube_tensor_driver.config.parameters import (
+    CONTACTS,
+    DRIVER,
+    MARKERS,
+    RECONSTRUCTION,
+    SIMULATED_IMU,
+)
 
 project = "cube_tensor_driver"
 author = "the cube_tensor_driver authors"
@@ -37,6 +43,7 @@ NODES = {
     "reconstruction": RECONSTRUCTION,
     "markers": MARKERS,
     "contacts": CONTACTS,
+    "simulated_imu": SIMULATED_IMU,
 }
 PAGE_NAME = re.compile(r"\[([a-z_]+\.md)\]\((?=\1[)#])")
 """Text of a link that is the file name of a page. The HTML page shows its title instead."""

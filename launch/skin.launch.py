@@ -67,6 +67,11 @@ ARGUMENTS = (
         "Path of the load script (YAML) that states the forces on a simulated skin.",
         str(DEMO_LOAD),
     ),
+    declare_text(
+        "imperfections",
+        "Path of a file (YAML) with deviations of simulated pads from their calibrations, among "
+        "them weight in a moving skin. With its key poses, an IMU is simulated, too.",
+    ),
     declare_switch(
         "composed",
         "Run driver and reconstruction in one process, which takes less CPU and latency.",
@@ -106,7 +111,12 @@ def start_skin(context: LaunchContext) -> list[Action]:
         # Each launch makes a new folder for the pseudo-terminals of its simulated hubs, so that two
         # simulated skins on one host do not use the same paths.
         ports = make_temporary_folder("cube_ports_")
-        simulated = SimulatedHubs(ports, given.load, noise=None)
+        simulated = SimulatedHubs(
+            ports,
+            given.load,
+            noise=None,
+            imperfections=given.imperfections,
+        )
     processes = skin_processes(
         given.config,
         composed="composed" in wanted,

@@ -115,11 +115,14 @@ FRAME_PREFIX = Parameter(
     "Text in front of the frame ids of the skin and its cubes, such as left_ for one of two skins "
     "with the same skin file.",
 )
-"""Declaration of the ROS parameter `frame_prefix` of the nodes `driver` and `reconstruction`."""
+"""Declaration of the ROS parameter `frame_prefix` of all nodes that read a skin file."""
+
+CONFIG = Parameter("config", "", "Path of the skin file (YAML). It is required.")
+"""Declaration of the ROS parameter `config` of the nodes `driver` and `simulated_imu`."""
 
 DRIVER = (
     AUTOSTART,
-    Parameter("config", "", "Path of the skin file (YAML). It is required."),
+    CONFIG,
     FRAME_PREFIX,
     Parameter(
         "port",
@@ -328,3 +331,15 @@ CONTACTS = (
 )
 """Declarations of the ROS parameters of the node `contacts`, which computes positions and forces of
 contacts."""
+
+SIMULATED_IMU = (
+    AUTOSTART,
+    CONFIG,
+    FRAME_PREFIX,
+    Parameter("port_directory", "", "Folder in which the simulated hubs make their ports."),
+    Parameter(
+        "imperfections", "", "Path of the file (YAML) from which the simulated hubs take `poses`."
+    ),
+)
+"""Declarations of the ROS parameters of the node `simulated_imu`, which goes with simulated hubs of
+a skin that moves."""

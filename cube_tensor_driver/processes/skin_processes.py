@@ -7,6 +7,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ..config.yaml import read_yaml
+
 Value = str | float | bool
 """Type of the value of a ROS parameter."""
 
@@ -75,6 +77,16 @@ class SimulatedHubs:
     noise: float | None = 0.0
     imperfections: Path | None = None
 
+    @property
+    def has_imu(self) -> bool:
+        """Whether the skin moves, so that an IMU on it is simulated, too.
+
+        Raises:
+            ConfigError: The file of imperfections cannot be read.
+        """
+        content = read_yaml(self.imperfections) if self.imperfections else None
+        return isinstance(content, dict) and bool(content.get("poses"))
+
     def process(self, config: Path) -> Process:
         """Return the process that simulates the hubs of the skin file `config`."""
         options = {
@@ -125,6 +137,10 @@ def skin_processes(
     if simulated is not None:
         processes.append(simulated.process(config))
         given["port_directory"] = str(simulated.ports)
+        if simulated.has_imu:
+            motion: dict[str, Value] = {"imperfections": str(simulated.imperfections)}
+            processes.append(_make_node_process("simulated_imu", given | motion))
+            given["imu"] = "imu"
     # The reconstruction starts first, so that it has subscribed before the driver publishes.
     names = ["composed"] if composed else ["reconstruction", "driver"]
     processes += [_make_node_process(name, given) for name in names]

@@ -33,6 +33,7 @@ from ..config.yaml import read_yaml, write_yaml
 from ..core.errors import ConfigError
 from ..device.live import make_link_configs
 from ..processes.skin_processes import Value
+from ..simulation.imperfections import read_imperfections
 
 _CONFIG = package_data() / "config"
 """Folder of the configuration files that are installed with the package."""
@@ -117,6 +118,7 @@ class SkinArguments(NamedTuple):
         config: Absolute path of the skin file.
         skin: Content of the skin file.
         load: Path of the load script, for simulated hubs.
+        imperfections: Path of the deviations of simulated pads; None: they have none.
         parameters: Name of a ROS parameter -> its value, for the arguments that set parameters of
             `driver` and `reconstruction`. Empty arguments are left out, so that a value that an
             including launch file sets with SetParameter is kept.
@@ -127,6 +129,7 @@ class SkinArguments(NamedTuple):
     config: Path
     skin: Skin
     load: Path
+    imperfections: Path | None
     parameters: dict[str, Value]
 
 
@@ -258,6 +261,10 @@ def check_arguments(
     skin = read_skin(path, texts["frame_prefix"])
     load = Path(texts["load"]).expanduser()
     read_script(load)
+    imperfections = None
+    if texts["imperfections"]:
+        imperfections = Path(texts["imperfections"]).expanduser()
+        read_imperfections(imperfections)
 
     parameters: dict[str, Value] = {}
     for name, text in texts.items():
@@ -279,6 +286,7 @@ def check_arguments(
         path,
         skin,
         load,
+        imperfections,
         parameters,
     )
 

@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""A simulated skin that moves: specific force at its cubes, and the stress of their pads by it.
+"""A simulated skin that moves: accelerations at its points, and the stress of its pads by weight.
 
 The parent frame of the skin has the position p(t) and rotation R(t) in the world, whose z axis
 points up. An accelerometer in a cube with the position r and rotation C in the parent frame
@@ -58,6 +58,62 @@ def read_weight(name: str, n_pads: int) -> Array:
     return model.response
 
 
+class MovingFrame:
+    """Computes what an accelerometer and a gyroscope in the parent frame of a skin measure."""
+
+    def __init__(self, knots: Sequence[Sequence[float]]) -> None:
+        """Prepare the motion.
+
+        Args:
+            knots: Poses of the parent frame over time, as `Imperfections.poses` defines them.
+        """
+        self._times, *self._columns = np.array(knots).T
+        self._numbers = np.arange(len(knots))
+
+    def _compute_pose(self, seconds: float) -> tuple[Array, Array]:
+        """Return position (3,), in m, and rotation (3, 3) of the parent frame at a time in s."""
+        number = np.interp(seconds, self._times, self._numbers)
+        begin = np.floor(number)
+        phase = np.pi * (number - begin)
+        eased = begin + 0.5 * (1 - np.cos(phase))
+        values = [np.interp(eased, self._numbers, column) for column in self._columns]
+        return np.array(values[:3]), rotation_from_rpy(*values[3:])
+
+    def angular_velocity(self, seconds: float) -> Array:
+        """Return the angular velocity (3,) at a time in s, along the parent frame, in rad/s."""
+        _, before = self._compute_pose(seconds - STEP_S)
+        _, now = self._compute_pose(seconds)
+        _, after = self._compute_pose(seconds + STEP_S)
+        turning = now.T @ (after - before) / (2 * STEP_S)
+        return np.array([turning[2, 1], turning[0, 2], turning[1, 0]])
+
+    def specific_force(
+        self,
+        seconds: float,
+        points: Array,
+        axes: Array,
+    ) -> Array:
+        """Return the specific force at N points of the parent frame (N, 3), in m/s².
+
+        Args:
+            seconds: Time in s.
+            points: The points (N, 3), in m.
+            axes: Rotations (N, 3, 3) from the frames of the results to the parent frame.
+        """
+        times = seconds - STEP_S, seconds, seconds + STEP_S
+        poses = [self._compute_pose(time) for time in times]
+        positions = []
+        for origin, rotation in poses:
+            positions.append(origin + points @ rotation.T)
+        before, now, after = positions
+        in_world = (after - 2 * now + before) / STEP_S**2
+        in_world[:, 2] += STANDARD_GRAVITY
+        _, rotation = poses[1]
+        to_world = rotation @ axes
+        force: Array = (in_world[:, None] @ to_world)[:, 0]
+        return force
+
+
 class HeavyPads:
     """Computes the specific force at some cubes of a moving skin, and the stress of pads by it."""
 
@@ -76,32 +132,11 @@ class HeavyPads:
         """
         self._response = response
         self._cubes = poses
-        self._times, *self._columns = np.array(knots).T
-        self._numbers = np.arange(len(knots))
-
-    def _compute_pose(self, seconds: float) -> tuple[Array, Array]:
-        """Return position (3,), in m, and rotation (3, 3) of the parent frame at a time in s."""
-        number = np.interp(seconds, self._times, self._numbers)
-        begin = np.floor(number)
-        phase = np.pi * (number - begin)
-        eased = begin + 0.5 * (1 - np.cos(phase))
-        values = [np.interp(eased, self._numbers, column) for column in self._columns]
-        return np.array(values[:3]), rotation_from_rpy(*values[3:])
+        self._frame = MovingFrame(knots)
 
     def specific_force(self, seconds: float) -> Array:
         """Return the specific force at each cube in its own frame (cubes, 3), in m/s²."""
-        times = seconds - STEP_S, seconds, seconds + STEP_S
-        poses = [self._compute_pose(time) for time in times]
-        positions = []
-        for origin, rotation in poses:
-            positions.append(origin + self._cubes.position @ rotation.T)
-        before, now, after = positions
-        in_world = (after - 2 * now + before) / STEP_S**2
-        in_world[:, 2] += STANDARD_GRAVITY
-        _, rotation = poses[1]
-        to_world = rotation @ self._cubes.rotation
-        force: Array = (in_world[:, None] @ to_world)[:, 0]
-        return force
+        return self._frame.specific_force(seconds, self._cubes.position, self._cubes.rotation)
 
     def stress(self, seconds: float) -> Array:
         """Return the stress of the pads by weight and inertia (cubes, P), in Pa."""

@@ -63,6 +63,10 @@ HUBS_FILE = ".hubs"
 """Name of a YAML file in the folder of the simulated ports with the number of cubes and pads of
 each link's hub (`HubSize`). It is written before the pipe for faults is created."""
 
+START_FILE = ".start"
+"""Name of a file in the folder of the simulated ports with the wall clock at simulated time 0, in
+ns since the Unix epoch."""
+
 _PIPE_BYTES = 65536
 """Maximum number of bytes that one read from the pipe for faults returns."""
 
@@ -136,6 +140,7 @@ class Simulator:
                 self._links.append(_connect(skin, carried, line))
             sizes = {link.name: asdict(link.size) for link in self._links}
             write_yaml(ports / HUBS_FILE, sizes)
+            (ports / START_FILE).write_text(str(self.start_time_ns))
             self._fault_pipe = _open_pipe(ports / FAULT_PIPE)
         except OSError as error:
             raise ConfigError(
@@ -246,7 +251,7 @@ class Simulator:
             link.line.unplug()
         os.close(self._fault_pipe)
         # `./cube inject` recognises a running simulator by these files.
-        for name in (FAULT_PIPE, HUBS_FILE):
+        for name in (FAULT_PIPE, HUBS_FILE, START_FILE):
             (self._ports / name).unlink(missing_ok=True)
         # The folder stays if it contains other files.
         with contextlib.suppress(OSError):

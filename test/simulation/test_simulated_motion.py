@@ -10,7 +10,7 @@ import pytest
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.tensor import rotation_from_rpy
-from cube_tensor_driver.simulation.motion import HeavyPads, read_weight
+from cube_tensor_driver.simulation.motion import HeavyPads, MovingFrame, read_weight
 
 G = 9.80665
 R = 0.2
@@ -47,6 +47,14 @@ def test_a_turn_has_centripetal_and_tangential_acceleration():
         expected = TILT.T @ [-R * rate**2, R * change, G]
         found = force_at(seconds, (0.0, *[0.0] * 6), (1.0, *[0.0] * 5, 1.0))
         np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
+def test_a_gyroscope_measures_along_the_axes_of_the_skin():
+    """yaw = (1 - cos(pi t)) / 2, about the z axis of the world, of a skin that is tilted."""
+    frame = MovingFrame([(0.0, 0, 0, 0, 0.3, 0.5, 0.0), (1.0, 0, 0, 0, 0.3, 0.5, 1.0)])
+    rate = 0.5 * np.pi * np.sin(np.pi * 0.25)
+    in_skin = rotation_from_rpy(0.3, 0.5, 0.0).T @ [0, 0, rate]
+    np.testing.assert_allclose(frame.angular_velocity(0.25), in_skin, atol=1e-5)
 
 
 def test_a_file_without_weight_or_for_other_pads_is_refused():
