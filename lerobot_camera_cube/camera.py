@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from lerobot.cameras import Camera, CameraConfig
 from lerobot.utils.errors import DeviceNotConnectedError
@@ -60,7 +59,7 @@ class CubeCamera(Camera):  # type: ignore[misc]
         return self._live is not None
 
     @staticmethod
-    def find_cameras() -> list[dict[str, Any]]:
+    def find_cameras() -> list[dict[str, object]]:
         """Return an empty list, because a skin is found by its skin file only."""
         return []
 

@@ -140,7 +140,7 @@ def show_exported(folder: Path, exported: Exported) -> None:
     )
     if exported.depth > UNUSUAL_DEPTH * exported.usual:
         say(
-            f"usual are {exported.usual} samples in a window, but one frame holds "
+            f"usual are {exported.usual:g} samples in a window, but one frame holds "
             f"{exported.depth}: hubs paused, or stamps are in doubt; --marks can leave that out",
             "yellow",
         )

@@ -8,6 +8,8 @@ Source of the format: `lerobot.datasets` in the package lerobot 0.4.4.
 from __future__ import annotations
 
 import json
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,16 +20,18 @@ from ..bags.tables import as_column
 from ..config.skin import Skin
 from ..core.arrays import AnyArray
 from ..core.modes import COMPONENTS, STRESS
+from .images import decode
 from .plan import Episode
-from .statistics import Statistics
+from .statistics import MAX_SAMPLE_ROWS, Part, describe, summarise
 from .topics import Topic
-from .windows import TACTILE, WINDOW_COLUMNS
+from .windows import TACTILE
 
 VERSION = "v3.0"
 """Version of LeRobotDataset, the file format for robot learning in which data sets are written."""
 
-MAX_FILES_PER_CHUNK = 1000
-"""Largest number of Parquet files in one folder (which LeRobot calls chunk) of a data set."""
+FILES_PER_CHUNK = 1000
+"""Number of Parquet files in one folder (LeRobot: chunk), above which LeRobot begins a new folder
+if it adds episodes to a data set."""
 
 FILE_MB = 100
 """Size of a file, in MB (2**20 bytes), above which LeRobot begins a new one if it adds episodes to
@@ -40,32 +44,29 @@ RESIDUAL = f"{TACTILE}.residual"
 """Name of the feature with the residual: the part of the pads' measurements that no stress
 explains, divided by their noise."""
 
-COUNTER_FEATURES = {
-    "timestamp": "float32",
-    "frame_index": "int64",
-    "episode_index": "int64",
-    "index": "int64",
-    "task_index": "int64",
-}
-"""Features that state the time and the numbers of each frame, its episode and its task, with their
-types. LeRobot requires them in every data set."""
+AXES = ("sample", "cube", "component")
+"""Names of the axes of the features of the stress."""
 
+IMAGE_AXES = ("height", "width", "channels")
+"""Names of the axes of an image."""
+
+PIXEL_STRIDE = 4
+"""Step, in pixels, along height and width between the pixels that enter the statistics of colours.
+With 4, one pixel in 16 is used."""
 
 _IMAGE = pyarrow.struct([("bytes", pyarrow.binary()), ("path", pyarrow.string())])
 """Parquet type of an image as LeRobot stores it: the bytes of the image file, or its path."""
+
+Columns = Mapping[str, AnyArray | list[bytes]]
+"""Values of features in n frames: arrays (n, …), or n image files each."""
 
 
 class DataSet:
     """A LeRobot data set (table of frames, which are time steps at a constant rate).
 
-    It is written episode after episode (an episode is one execution of a task), and is a context
-    manager that closes its files.
+    It is written episode after episode (an episode is one execution of a task).
 
     Attributes:
-        fps: Frames per second.
-        depth: Number of samples of each cube that a frame has room for.
-        frames: Number of frames written so far.
-        episodes: Description of each complete episode: a row of the table in meta/episodes/.
         calibrations: One entry for the first calibrations, and one for each change: the ids of the
             cubes' calibrations, and bag and stamp (ns since the Unix epoch) from which on they were
             used.
@@ -76,123 +77,126 @@ class DataSet:
         folder: Path,
         skin: Skin,
         topics: list[Topic],
-        *,
         fps: int,
-        depth: int,
         frames: int,
     ) -> None:
-        """Create the folder of the data set.
+        """Begin an empty data set.
 
         Args:
             folder: Folder of the data set.
             skin: Skin of all bags.
             topics: Topics other than stress that become features (columns), such as images.
             fps: Frames per second.
-            depth: Number of samples of each cube that a frame has room for.
             frames: Total number of frames that will be written.
         """
-        (folder / "meta" / "episodes" / "chunk-000").mkdir(parents=True)
-        self.fps, self.depth = fps, depth
-        self.frames = 0
-        self.episodes: list[dict[str, object]] = []
         self.calibrations: list[dict[str, object]] = []
         self._folder = folder
         self._skin = skin
-        self._topics = topics
-        self._tasks: list[str] = []
+        self._fps = fps
+        self._total_frames = frames
+        self._names = {topic.key: list(topic.names) for topic in topics}
+        self._names[f"{TACTILE}.count"] = list(skin.names)
+        self._features: dict[str, dict[str, object]] = {}
+        self._tasks: dict[str, int] = {}
+        self._episodes: list[dict[str, object]] = []
         self._writer: pyarrow.parquet.ParquetWriter | None = None
         self._file_number = 0
-        # Integer columns beside the stress (stamps, status bits) have no statistics, because
-        # policies do not normalise them. Statistics of the stress have one row for each sample of a
-        # cube that the frames have room for, all others one per frame.
-        samples = frames * depth * len(skin.cubes)
-        self._statistic_rows = {TACTILE: samples, RESIDUAL: samples}
-        others = [topic.key for topic in topics]
-        for key in [*others, *COUNTER_FEATURES]:
-            self._statistic_rows[key] = frames
-        self._statistics = self.new_statistics()
+        self._frames = self._first_frame = 0
+        self._random = np.random.default_rng(0)
+        # The values of every feature are described in as many parts. The statistics of an episode
+        # are those of the parts from `_first_part` on.
+        self._parts: dict[str, list[Part]] = defaultdict(list)
+        self._first_part = 0
 
-    def __enter__(self) -> DataSet:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close_file()
-
-    def new_statistics(self) -> dict[str, Statistics]:
-        """Return empty statistics, by the names of the features (columns) that have statistics."""
-        return {key: Statistics(rows) for key, rows in self._statistic_rows.items()}
-
-    def write(
-        self,
-        columns: dict[str, AnyArray | list[bytes]],
-    ) -> None:
-        """Write successive frames (time steps) as one group of rows of the current Parquet file.
+    def write(self, columns: Columns, task: str) -> None:
+        """Write successive frames of an episode as one group of rows of the current Parquet file.
 
         Args:
-            columns: By the names of the features (columns of the data set): arrays whose first
-                dimension is the frames, or a list of image files with one per frame.
+            columns: Values of all features except the counters, by the names of the features.
+            task: Text of the episode's task.
         """
-        table = pyarrow.table({name: _as_column(values) for name, values in columns.items()})
+        index = self._frames + np.arange(len(columns[TACTILE]))
+        frame = index - self._first_frame
+        task_index = self._tasks.setdefault(task, len(self._tasks))
+        counters: dict[str, AnyArray] = {
+            "timestamp": (frame / self._fps).astype(np.float32),
+            "frame_index": frame,
+            "episode_index": np.full_like(frame, len(self._episodes)),
+            "index": index,
+            "task_index": np.full_like(frame, task_index),
+        }
+        counted = {key: values[:, np.newaxis] for key, values in counters.items()}
+        columns = {**columns, **counted}
+        table = pyarrow.table({key: _as_column(one) for key, one in columns.items()})
         if self._writer is None:
-            name = FILE_NAME.format(**self._place())
+            name = FILE_NAME.format(chunk_index=0, file_index=self._file_number)
             path = self._folder / "data" / name
             path.parent.mkdir(parents=True, exist_ok=True)
             # Dictionary encoding saves space only if values repeat. Measured ones rarely do.
             self._writer = pyarrow.parquet.ParquetWriter(
-                path,
-                table.schema,
-                compression="zstd",
-                use_dictionary=False,
+                path, table.schema, compression="zstd", use_dictionary=False
             )
         self._writer.write_table(table)
-        self.frames += len(table)
+        self._frames += len(table)
+
+        for key, values in columns.items():
+            if isinstance(values, list):
+                # A few pixels of one image suffice. Decoding every image would be slow.
+                pixels: AnyArray = decode(values[0])
+                shape = pixels.shape
+                names: Sequence[str] | None = IMAGE_AXES
+                few = pixels[::PIXEL_STRIDE, ::PIXEL_STRIDE]
+                # LeRobot normalises images of the shape (bands, height, width), to which statistics
+                # of the shape (bands, 1, 1) are broadcast.
+                rows: AnyArray = few.reshape(-1, shape[2], 1, 1)
+            else:
+                shape = values.shape[1:]
+                names = AXES[: len(shape)] if len(shape) > 1 else self._names.get(key)
+                rows = values.reshape(-1, 1 if key == RESIDUAL else shape[-1])
+            dtype = "image" if isinstance(values, list) else values.dtype.name
+            self._features[key] = {"dtype": dtype, "shape": shape, "names": names}
+            # Integers beside the stress (stamps, status bits) have no statistics, because policies
+            # do not normalise them.
+            if key in (TACTILE, RESIDUAL) or not key.startswith(TACTILE):
+                expected_rows = len(rows) * self._total_frames / len(table)
+                is_chosen = self._random.random(len(rows)) < MAX_SAMPLE_ROWS / expected_rows
+                self._parts[key].append(describe(rows, is_chosen))
 
     def close_file(self) -> None:
-        """Complete the current Parquet file, if there is one; frames that follow get a new file."""
+        """Complete the current Parquet file; frames that follow get a new file."""
         if self._writer is not None:
             self._writer.close()
             self._writer = None
             self._file_number += 1
 
-    def task_index(self, task: str) -> int:
-        """Return the index of a task, which is described by a text, in the table of tasks."""
-        if task not in self._tasks:
-            self._tasks.append(task)
-        return self._tasks.index(task)
-
-    def end_episode(
-        self,
-        episode: Episode,
-        statistics: dict[str, Statistics],
-    ) -> None:
-        """Add an episode (one execution of a task) to the table of episodes.
+    def end_episode(self, episode: Episode, bag: str) -> None:
+        """Add an episode, whose frames have all been written, to the table of episodes.
 
         Args:
-            episode: The episode, whose frames have all been written.
-            statistics: Statistics of the episode, by the names of the features.
+            episode: The episode.
+            bag: Name of its bag.
         """
-        frames = len(episode.counts)
-        place = self._place()
-        described = {
-            "episode_index": len(self.episodes),
+        frames = len(episode.frames)
+        described: dict[str, object] = {
+            "episode_index": len(self._episodes),
             "tasks": [episode.task],
             "length": frames,
-            "data/chunk_index": place["chunk_index"],
-            "data/file_index": place["file_index"],
-            "dataset_from_index": self.frames - frames,
-            "dataset_to_index": self.frames,
+            "data/chunk_index": 0,
+            "data/file_index": self._file_number,
+            "dataset_from_index": self._first_frame,
+            "dataset_to_index": self._frames,
             # The descriptions of all episodes are in one file, because each takes only some kB.
             "meta/episodes/chunk_index": 0,
             "meta/episodes/file_index": 0,
-            "bag": episode.bag.name,
+            "bag": bag,
             "begin_ns": episode.begin_ns,
         }
-        for key, one in statistics.items():
-            lists = _as_lists(one, frames)
-            for name, values in lists.items():
-                described[f"stats/{key}/{name}"] = values
-            self._statistics[key].merge(one)
-        self.episodes.append(described)
+        for key, parts in self._parts.items():
+            statistics = summarise(parts[self._first_part :], frames)
+            described |= {f"stats/{key}/{name}": value for name, value in statistics.items()}
+        self._episodes.append(described)
+        self._first_frame = self._frames
+        self._first_part = len(self._parts[TACTILE])
 
     def write_meta(self) -> None:
         """Write episodes, tasks, features and statistics into the folder meta/ of the data set.
@@ -200,77 +204,36 @@ class DataSet:
         It is called once, after the last episode.
         """
         meta = self._folder / "meta"
-        episodes = pyarrow.Table.from_pylist(self.episodes)
-        path = FILE_NAME.format(chunk_index=0, file_index=0)
-        pyarrow.parquet.write_table(episodes, meta / "episodes" / path)
-        tasks = _make_task_table(self._tasks)
-        pyarrow.parquet.write_table(tasks, meta / "tasks.parquet")
-        _write_json(
-            meta / "info.json",
-            {
-                "codebase_version": VERSION,
-                "robot_type": self._skin.name,
-                "total_episodes": len(self.episodes),
-                "total_frames": self.frames,
-                "total_tasks": len(self._tasks),
-                "chunks_size": MAX_FILES_PER_CHUNK,
-                "data_files_size_in_mb": FILE_MB,
-                "video_files_size_in_mb": FILE_MB,
-                "fps": self.fps,
-                "splits": {"train": f"0:{len(self.episodes)}"},
-                "data_path": f"data/{FILE_NAME}",
-                "video_path": None,
-                "features": self._describe_features(),
-            },
-        )
-        statistics = {}
-        for key, one in self._statistics.items():
-            statistics[key] = _as_lists(one, self.frames)
-        _write_json(meta / "stats.json", statistics)
-
-    def _place(self) -> dict[str, int]:
-        """Return the numbers of the current Parquet file and of its folder, which LeRobot calls
-        chunk."""
-        chunk, file = divmod(self._file_number, MAX_FILES_PER_CHUNK)
-        return {"chunk_index": chunk, "file_index": file}
-
-    def _describe_features(self) -> dict[str, dict[str, object]]:
-        """Return the description of all features (columns of the data set) for info.json.
-
-        The skin is described under the key ``info`` of the tactile feature, because LeRobot's tools
-        keep this key when they copy or merge data sets.
-        """
-        cubes = len(self._skin.cubes)
-        window = (self.depth, cubes)
-        axes = ["sample", "cube", "component"]
-        about = describe_skin(self._skin) | {"calibrations": self.calibrations}
-        shape = (*window, len(COMPONENTS))
-        tactile = _describe_feature("float32", shape, axes)
-        features = {TACTILE: tactile | {"info": about}}
-        for name, kind in WINDOW_COLUMNS.items():
-            dtype = np.dtype(kind).name
-            features[f"{TACTILE}.{name}"] = _describe_feature(dtype, window, axes[:2])
-        names = list(self._skin.names)
-        features[f"{TACTILE}.count"] = _describe_feature("int64", (cubes,), names)
-        for topic in self._topics:
-            if topic.is_image:
-                axes = ["height", "width", "channels"]
-                described = _describe_feature("image", topic.shape, axes)
-            else:
-                width = len(topic.names)
-                described = _describe_feature("float32", (width,), topic.names)
-            features[topic.key] = described
-        for key, dtype in COUNTER_FEATURES.items():
-            features[key] = _describe_feature(dtype, (1,), None)
-        return features
+        path = meta / "episodes" / FILE_NAME.format(chunk_index=0, file_index=0)
+        path.parent.mkdir(parents=True)
+        pyarrow.parquet.write_table(pyarrow.Table.from_pylist(self._episodes), path)
+        _write_tasks(list(self._tasks), meta / "tasks.parquet")
+        # LeRobot's tools keep the key "info" of a feature when they copy or merge data sets.
+        about = _describe_skin(self._skin)
+        self._features[TACTILE]["info"] = about | {"calibrations": self.calibrations}
+        info = {
+            "codebase_version": VERSION,
+            "robot_type": self._skin.name,
+            "total_episodes": len(self._episodes),
+            "total_frames": self._frames,
+            "total_tasks": len(self._tasks),
+            "chunks_size": FILES_PER_CHUNK,
+            "data_files_size_in_mb": FILE_MB,
+            "video_files_size_in_mb": FILE_MB,
+            "fps": self._fps,
+            "splits": {"train": f"0:{len(self._episodes)}"},
+            "data_path": f"data/{FILE_NAME}",
+            "video_path": None,
+            "features": self._features,
+        }
+        statistics = {key: summarise(parts, self._frames) for key, parts in self._parts.items()}
+        for name, value in (("info", info), ("stats", statistics)):
+            text = json.dumps(value, indent=4, ensure_ascii=False)
+            (meta / f"{name}.json").write_text(text + "\n", encoding="utf-8")
 
 
 def _as_column(values: AnyArray | list[bytes]) -> pyarrow.Array:
-    """Return the values of a feature in n frames as a column of the Parquet file.
-
-    Args:
-        values: Contents of n image files, or an array (n, …).
-    """
+    """Return the values of a feature as a column of the Parquet file."""
     if isinstance(values, list):
         # LeRobot reads an image from the bytes if it has no path to an image file.
         return pyarrow.array([{"bytes": image, "path": None} for image in values], _IMAGE)
@@ -279,71 +242,8 @@ def _as_column(values: AnyArray | list[bytes]) -> pyarrow.Array:
     return as_column(values[:, 0] if is_one_number else values)
 
 
-def describe_skin(skin: Skin) -> dict[str, object]:
-    """Describe the feature `observation.tactile` (stress): components, units, and cubes' poses."""
-    cubes = [
-        {
-            "name": cube.name,
-            "frame": skin.frame(cube),
-            "xyz": list(cube.xyz),
-            "rpy": list(cube.rpy),
-            "half_side": cube.calibration.half_side,
-            "uid": cube.uid,
-        }
-        for cube in skin.cubes
-    ]
-    return {
-        "components": list(COMPONENTS),
-        "units": ["Pa" if name in STRESS else "Pa/m" for name in COMPONENTS],
-        "sign": "tension is positive",
-        "frame": "each cube's own: right-handed, z out of the skin",
-        "unknown": "NaN: not observed, or in front of the first sample of a window",
-        "parent_frame": skin.parent_frame,
-        "pose_units": "m, rad (fixed axes x y z)",
-        "cubes": cubes,
-    }
-
-
-def _describe_feature(
-    dtype: str,
-    shape: tuple[int, ...],
-    names: list[str] | None,
-) -> dict[str, object]:
-    """Return the description of one feature (column of the data set) for info.json.
-
-    Args:
-        dtype: Name of its type, such as ``float32`` or ``image``.
-        shape: Shape of its value in one frame.
-        names: Names of the axes, or of the numbers of a vector; None: it has none.
-    """
-    return {
-        "dtype": dtype,
-        "shape": list(shape),
-        "names": names,
-    }
-
-
-def _as_lists(
-    statistics: Statistics,
-    frames: int,
-) -> dict[str, object]:
-    """Return the statistics of a feature as lists, which JSON and Parquet can contain.
-
-    Args:
-        statistics: Statistics of the feature.
-        frames: Number of frames (time steps of the data set), which LeRobot uses as the weight of
-            the statistics when it merges data sets.
-    """
-    lists = {name: values.tolist() for name, values in statistics.result().items()}
-    return {"count": [frames], **lists}
-
-
-def _make_task_table(tasks: list[str]) -> pyarrow.Table:
-    """Return the table of tasks: the index of each task, and its text as the row label in pandas.
-
-    Args:
-        tasks: Texts of the tasks, by their indices.
-    """
+def _write_tasks(tasks: list[str], path: Path) -> None:
+    """Write the table of tasks: the index of each task, and its text as the row label in pandas."""
     # This metadata makes the texts the row labels in pandas. Its format is described in
     # https://pandas.pydata.org/docs/development/developer.html
     label = {
@@ -352,16 +252,32 @@ def _make_task_table(tasks: list[str]) -> pyarrow.Table:
         "pandas_type": "unicode",
         "numpy_type": "object",
     }
-    described = {"index_columns": ["task"], "columns": [label]}
-    columns = {
-        "task_index": range(len(tasks)),
-        "task": tasks,
+    described = json.dumps({"index_columns": ["task"], "columns": [label]})
+    table = pyarrow.table({"task_index": range(len(tasks)), "task": tasks})
+    table = table.replace_schema_metadata({"pandas": described})
+    pyarrow.parquet.write_table(table, path)
+
+
+def _describe_skin(skin: Skin) -> dict[str, object]:
+    """Describe the feature `observation.tactile` (stress): components, units, and cubes' poses."""
+    cubes = [
+        {
+            "name": cube.name,
+            "frame": skin.frame(cube),
+            "xyz": cube.xyz,
+            "rpy": cube.rpy,
+            "half_side": cube.calibration.half_side,
+            "uid": cube.uid,
+        }
+        for cube in skin.cubes
+    ]
+    return {
+        "components": COMPONENTS,
+        "units": ["Pa" if name in STRESS else "Pa/m" for name in COMPONENTS],
+        "sign": "tension is positive",
+        "frame": "each cube's own: right-handed, z out of the skin",
+        "unknown": "NaN: not observed, or in front of the first sample of a window",
+        "parent_frame": skin.parent_frame,
+        "pose_units": "m, rad (fixed axes x y z)",
+        "cubes": cubes,
     }
-    table = pyarrow.table(columns)
-    return table.replace_schema_metadata({"pandas": json.dumps(described)})
-
-
-def _write_json(path: Path, value: object) -> None:
-    """Write a value to a JSON file as LeRobot does: indented, in UTF-8."""
-    text = json.dumps(value, indent=4, ensure_ascii=False)
-    path.write_text(text + "\n", encoding="utf-8")

@@ -14,6 +14,7 @@ from __future__ import annotations
 import threading
 import time
 from pathlib import Path
+from queue import Empty, SimpleQueue
 
 import numpy as np
 import pyarrow
@@ -117,18 +118,14 @@ class LiveWindows:
         folder.mkdir(parents=True, exist_ok=True)
         self._folder = folder
         self._source = source
-        self._cubes = len(source.skin.cubes)
         self._full_scale = full_scale
-        self._pressure = np.full(self._cubes, np.nan)
         self._cube_at = nearest_cubes(source.skin, width, height)
+        self._level = np.full(len(source.skin.cubes), np.nan)
         self._number = 0
         self._writer: pyarrow.ipc.RecordBatchStreamWriter | None = None
-        self._rows: list[StressRows] = []
-        self._newest_ns = 0
         rate = source.skin.rate
         self._max_age_ns = max(MAX_AGE_NS, round(1e9 / rate) if rate else 0)
-        self._failure: CubeError | None = None
-        self._changed = threading.Condition()
+        self._arrived: SimpleQueue[StressRows | CubeError] = SimpleQueue()
         self._thread = threading.Thread(target=self._collect, daemon=True)
         self._thread.start()
 
@@ -147,27 +144,34 @@ class LiveWindows:
             CubeError: The thread that reads the links has failed.
         """
         wanted_ns = time.time_ns() - self._max_age_ns
-        with self._changed:
-            self._changed.wait_for(
-                lambda: self._newest_ns >= wanted_ns or self._failure, min(CATCH_UP_S, timeout_s)
-            )
-            self._changed.wait_for(lambda: self._rows or self._failure, timeout_s)
-            parts, self._rows = self._rows, []
+        end_s = time.monotonic() + min(CATCH_UP_S, timeout_s)
+        parts: list[StressRows] = []
+        newest_ns = 0
+        while newest_ns < wanted_ns or not self._arrived.empty():
+            wait_s = max(0.0, end_s - time.monotonic()) if parts else timeout_s
+            try:
+                part = self._arrived.get(timeout=wait_s)
+            except Empty:
+                break
+            if isinstance(part, CubeError):
+                # The error is put back, so that later calls raise it, too.
+                self._arrived.put(part)
+                if parts:
+                    break
+                raise part
+            parts.append(part)
+            newest_ns = int(part.stamp_ns.max(initial=0))
         if not parts:
-            if self._failure is not None:
-                raise self._failure
             raise TimeoutError(
                 f"skin {self._source.skin.name}: no sample in {timeout_s:g} s; check that the hubs "
                 "are connected and that no other program reads them"
             )
         rows = concatenate(parts)
         # Frame numbers must rise, although the clock of the computer may be set back.
-        now_ms = time.time_ns() // 1_000_000
-        self._number = max(self._number + 1, now_ms)
+        self._number = max(self._number + 1, time.time_ns() // 1_000_000)
         self._write(rows)
         # In an assignment with repeated indices numpy keeps the last value, which is the newest.
-        stress_zz = rows.stress[:, 2]
-        self._pressure[rows.cube] = -stress_zz
+        self._level[rows.cube] = -rows.stress[:, 2] / self._full_scale
         return self._make_picture()
 
     def close(self) -> None:
@@ -184,29 +188,19 @@ class LiveWindows:
         reconstruct = Reconstructor(self._source.skin)
         try:
             for rows in self._source:
-                stress = reconstruct(rows)
-                with self._changed:
-                    self._rows.append(stress)
-                    self._newest_ns = int(stress.stamp_ns.max(initial=0))
-                    self._changed.notify()
+                self._arrived.put(reconstruct(rows))
         except CubeError as error:
-            with self._changed:
-                self._failure = error
-                self._changed.notify()
+            self._arrived.put(error)
 
     def _write(self, rows: StressRows) -> None:
         """Write the rows (samples of cubes) of one frame as one batch of the Arrow stream."""
-        counts = np.bincount(rows.cube, minlength=self._cubes)
+        n_cubes = len(self._level)
+        depth = int(np.bincount(rows.cube).max())
         first_frame = np.zeros(len(rows), np.intp)
-        columns = arrange_windows(
-            counts[np.newaxis],
-            int(counts.max()),
-            first_frame,
-            rows,
-        )
+        columns = arrange_windows(first_frame, rows, (1, depth, n_cubes))
         arrays = {name: as_column(values) for name, values in columns.items()}
-        number = pyarrow.array([self._number])
-        batch = pyarrow.record_batch({NUMBER_COLUMN: number} | arrays)
+        arrays[NUMBER_COLUMN] = pyarrow.array([self._number])
+        batch = pyarrow.record_batch(arrays)
         if self._writer is None:
             path = self._folder / f"{self._number}.arrow"
             self._writer = pyarrow.ipc.new_stream(str(path), batch.schema)
@@ -214,19 +208,17 @@ class LiveWindows:
 
     def _make_picture(self) -> AnyArray:
         """Return the picture of the newest pressures, with the frame number at the top."""
-        level = np.clip(self._pressure / self._full_scale, -1.0, 1.0)
-        colours = np.zeros((self._cubes, 3))
-        colours[:, 0] = 255 * np.maximum(level, 0)
-        colours[:, 2] = 255 * np.maximum(-level, 0)
-        colours[np.isnan(level)] = UNKNOWN_GREY
+        red = np.clip(self._level, 0.0, 1.0)
+        blue = np.clip(-self._level, 0.0, 1.0)
+        colours = 255 * np.column_stack([red, np.zeros_like(red), blue])
+        colours[np.isnan(red)] = UNKNOWN_GREY
         picture = colours.astype(np.uint8)[self._cube_at]
 
-        number = self._number.to_bytes(NUMBER_BYTES, "big")
-        number_bytes = np.frombuffer(number, np.uint8)
-        bits = np.unpackbits(number_bytes).reshape(NUMBER_GRID)
+        number_bytes = self._number.to_bytes(NUMBER_BYTES, "big")
+        bits = np.unpackbits(np.frombuffer(number_bytes, np.uint8))
         side = picture.shape[1] // NUMBER_GRID[1]
-        strips = bits.repeat(MIN_SQUARE, axis=0)
-        squares = 255 * strips.repeat(side, axis=1)
+        square = np.full((MIN_SQUARE, side), 255, np.uint8)
+        squares = np.kron(bits.reshape(NUMBER_GRID), square)
         rows, columns = squares.shape
         picture[:rows, :columns] = squares[..., np.newaxis]
         return picture
@@ -252,8 +244,7 @@ class RecordedWindows:
         for path in paths:
             file = pyarrow.memory_map(str(path))
             for batch in pyarrow.ipc.open_stream(file):
-                number = batch[NUMBER_COLUMN][0].as_py()
-                self._frames[number] = batch
+                self._frames[batch[NUMBER_COLUMN][0].as_py()] = batch
 
     def __len__(self) -> int:
         """Return the number of frames that were read, including those that no data set kept."""
@@ -314,27 +305,19 @@ def nearest_cubes(skin: Skin, width: int, height: int) -> AnyArray:
         height: Height of the picture, in pixels.
     """
     position = skin.poses.position
-    offset = position - position.mean(axis=0)
-    thickness = np.ptp(offset, axis=0)
+    thickness = np.ptp(position, axis=0)
     # The two widest directions are sorted, so that a flat skin appears as in its skin file, with x
     # to the right and y up.
-    widest = np.argsort(-thickness, kind="stable")[:2]
-    kept = np.sort(widest)
-    across, up = offset[:, kept].T
+    widest = np.sort(np.argsort(-thickness, kind="stable")[:2])
+    across, up = (position - position.mean(axis=0))[:, widest].T
     top = NUMBER_GRID[0] * MIN_SQUARE
     free = height - top
-    horizontal_extent = np.ptp(across) / width
-    vertical_extent = np.ptp(up) / free
-    extent = max(horizontal_extent, vertical_extent)
     # The centres of the cubes fill 1/1.2 of the picture. With this margin, the cubes at the edges
     # appear about as large as the others.
-    pixel = 1.2 * extent if extent > 0 else 1.0
-    columns = pixel * (np.arange(width) - width / 2)
+    pixel = 1.2 * max(np.ptp(across) / width, np.ptp(up) / free) or 1.0
+    distance_x = np.subtract.outer(pixel * (np.arange(width) - width / 2), across)
     nearest = np.zeros((height, width), np.intp)
     for row in range(top, height):
-        y = pixel * (top + free / 2 - row)
-        distance_x = np.subtract.outer(columns, across)
-        distance_y = y - up
-        squared = distance_x**2 + distance_y**2
-        nearest[row] = squared.argmin(axis=1)
+        distance_y = pixel * (top + free / 2 - row) - up
+        nearest[row] = (distance_x**2 + distance_y**2).argmin(axis=1)
     return nearest

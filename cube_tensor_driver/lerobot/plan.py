@@ -1,23 +1,23 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""First pass over a bag: it finds the episodes and counts the samples of each cube in every frame.
+"""Division of a bag into the episodes and frames of a data set.
 
-A frame is one time step of a data set. Frame k of an episode contains the samples with stamps t::
+A frame is one time step. Frame k of an episode contains the samples with stamps t::
 
     begin + k / fps <= t < begin + (k + 1) / fps
 
-All frames of a data set have room for the same number of samples (the size of the window), which
-must therefore be known before the first frame is written.
+where ``begin`` is the first stamp in the episode. All frames of a data set have room for the same
+number of samples, which must be known before the first frame is written.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,46 +25,35 @@ from ..bags.read import MAX_TIME_NS, Bag
 from ..bags.reprocess.job import AS_RECORDED, Overrides
 from ..bags.source import BagSource, open_bag
 from ..config.skin import Skin
-from ..core.arrays import AnyArray, Index, Mask, Times
+from ..core.arrays import AnyArray, Index, Times
 from ..core.errors import BagError
-from ..messages.codec import SECOND
+from ..messages.codec import SECOND, frequency_codec
 
 MARK_TYPE = "std_msgs/msg/String"
-"""Message type of marks: recorded texts that divide a bag into episodes (executions of a task). The
-text of a mark is the task of the episode that begins with it."""
-
-MIN_NS = -(1 << 63)
-"""Smallest time in 64 bits, in ns. A bag without marks (texts that begin an episode) has a single
-episode that begins at this time."""
+"""Message type of marks: recorded texts that divide a bag into episodes (executions of a task)."""
 
 MAX_STAMP_RATIO = 10
-"""Largest allowed ratio of the time between the first and the last stamp of an episode (execution
-of a task) to the duration of the recording. A larger ratio means that a clock was set, and is an
-error.
+"""Largest allowed ratio of the time between the first and the last stamp of an episode to the
+duration of the recording. A larger ratio means that a clock was set, and is an error.
 
 The ratio can be above 1, because a bag may be recorded from a replay at several times its speed.
 """
 
 MAX_DEPTH_RATIO = 10
-"""Largest allowed ratio of the number of a cube's samples in one frame (time step) to the number
-that follows from the sample rate.
+"""Largest allowed ratio of the number of a cube's samples in one frame to the number that follows
+from the sample rate.
 
 Every frame of a data set has room for as many samples as the fullest frame. If wrong stamps put
 many samples into one frame, the size of the whole data set would be multiplied.
 """
 
 ALWAYS_ALLOWED_COUNT = 100
-"""Number that is added to two limits: to the largest allowed number of frames (time steps) of an
-episode, and to the largest allowed number of samples of a cube in one frame.
+"""Number of frames of an episode, and number of samples in a frame, that are added to the limits
+which `MAX_STAMP_RATIO` and `MAX_DEPTH_RATIO` set.
 
-The limits are multiples (`MAX_STAMP_RATIO`, `MAX_DEPTH_RATIO`) of the numbers that are expected
-from the duration of the recording and the sample rate. Without this addition, a few samples that
-were stamped late would exceed the limits in a recording of a few frames, although nothing is wrong.
+Without this addition, a few samples that were stamped late would exceed the limits in a recording
+of a few frames, although nothing is wrong.
 """
-
-Report = Callable[[float, float, str], None]
-"""Function that displays progress. Its arguments are the amount done, the total amount (in the same
-unit, messages or samples), and a text that names the current step."""
 
 
 @dataclass(frozen=True)
@@ -94,293 +83,169 @@ class Choices:
     overrides: Overrides = AS_RECORDED
 
 
-class Episode:
-    """An episode of a bag (one execution of a task), and its numbers of samples.
+class Episode(NamedTuple):
+    """An episode of a bag: one execution of a task.
 
     Attributes:
-        bag: Folder or file of the bag.
         task: Text of the task, such as "pick up the cup".
-        begin_ns: Time at which frame 0 begins, in ns since the Unix epoch: the earliest stamp among
-            the first samples that are counted.
-        rows: Number of samples of all cubes.
-        counts: (frames, cubes) number of samples of each cube in each frame (time step of the data
-            set).
+        begin_ns: Time at which its first frame begins, in ns since the Unix epoch.
+        frames: Numbers of its frames among the intervals of the bag (`BagPlan.find_frames`).
     """
 
-    def __init__(
-        self,
-        bag: Path,
-        span: tuple[int, int, str],
-        *,
-        fps: int,
-        n_cubes: int,
-        max_frames: float,
-    ) -> None:
-        """Make an episode without samples.
+    task: str
+    begin_ns: int
+    frames: range
 
-        Args:
-            bag: Folder or file of the bag.
-            span: Smallest stamp that belongs to the episode, the stamp from which on nothing
-                belongs to it (both in ns since the Unix epoch), and the text of its task.
-            fps: Frames per second.
-            n_cubes: Number of cubes of the skin.
-            max_frames: Largest plausible number of frames for the duration of the recording.
-        """
-        self.bag = bag
-        self._since_ns, self._until_ns, self.task = span
-        self._fps, self._max_frames = fps, max_frames
-        self.begin_ns = self.rows = 0
-        shape = (0, n_cubes)
-        self.counts: AnyArray = np.zeros(shape, np.uint32)
-
-    def contains(self, stamp_ns: Times) -> Mask:
-        """Return whether each stamp (N,), in ns since the Unix epoch, lies in the episode."""
-        return (stamp_ns >= self._since_ns) & (stamp_ns < self._until_ns)
-
-    def frame_of(self, stamp_ns: Times) -> Index:
-        """Return the number of the frame (time step of the data set) in which each stamp lies.
-
-        Args:
-            stamp_ns: (N,) stamps, in ns since the Unix epoch.
-
-        Returns:
-            (N,) numbers of frames; they are negative for stamps before `begin_ns`.
-        """
-        # Whole seconds are multiplied separately, because the product of a time in ns and the frame
-        # rate may exceed 64 bits if a clock was never set.
-        seconds, rest_ns = np.divmod(stamp_ns - self.begin_ns, SECOND)
-        frames: Index = seconds * self._fps + rest_ns * self._fps // SECOND
-        return frames
-
-    def sample_frame_of(self, stamp_ns: Times) -> Index:
-        """Return the number of the frame (time step) to which the sample with each stamp belongs.
-
-        Samples before `begin_ns` belong to frame 0: the samples of some hubs arrive later than the
-        first counted sample, but were taken a little earlier.
-
-        Args:
-            stamp_ns: (N,) stamps, in ns since the Unix epoch.
-        """
-        return np.maximum(self.frame_of(stamp_ns), 0)
-
-    def count(self, cube: Index, stamp_ns: Times) -> None:
-        """Count those samples whose stamps lie in the episode.
-
-        Args:
-            cube: (N,) index of the cube of each sample.
-            stamp_ns: (N,) stamps, in ns since the Unix epoch.
-
-        Raises:
-            BagError: A stamp is so late that the episode would have more frames than is plausible
-                for the duration of the recording.
-        """
-        inside = self.contains(stamp_ns)
-        cube = cube[inside]
-        stamp_ns = stamp_ns[inside]
-        if not len(cube):
-            return
-        # The first samples determine the begin of frame 0 (the first time step). Samples that are
-        # read later but have earlier stamps are put into frame 0, too.
-        if not self.rows:
-            self.begin_ns = int(stamp_ns.min())
-        frame = self.sample_frame_of(stamp_ns)
-        n_frames = int(frame.max()) + 1
-        if n_frames > self._max_frames:
-            late_ns = int(stamp_ns.max()) - self.begin_ns
-            late_s = late_ns / SECOND
-            raise BagError(
-                f"{self.bag}: a sample is stamped {late_s:.0f} s after the first of its episode, "
-                "which is longer than was recorded: a clock was set; leave it out with --marks"
-            )
-        if n_frames > len(self.counts):
-            # The number of frames is not known before the end, so the table of counts grows by half
-            # each time it is full. If it grew by single frames, it would be copied too often.
-            room = 3 * n_frames // 2
-            n_cubes = self.counts.shape[1]
-            self.counts.resize((room, n_cubes), refcheck=False)
-        self.rows += len(cube)
-        np.add.at(self.counts, (frame, cube), 1)
-
-    def finish(self) -> None:
-        """Remove the empty frames (time steps) after the last sample.
-
-        It is called once, when all samples of the bag have been counted.
-        """
-        has_samples = self.counts.any(axis=1)
-        last = np.flatnonzero(has_samples)[-1]
-        self.counts = self.counts[: last + 1]
+    def blocks(self, length: int) -> list[range]:
+        """Divide the frames into blocks of a length; the last one may be shorter."""
+        return [self.frames[k : k + length] for k in range(0, len(self.frames), length)]
 
 
 @dataclass(frozen=True, eq=False)
 class BagPlan:
-    """Episodes of a bag that are exported, and numbers of the samples that are not.
+    """Episodes and frames of a bag.
 
     Attributes:
         path: Folder or file of the bag.
         skin: The skin (cubes and their poses) as the bag describes it.
         episodes: Episodes of the bag that have samples.
-        rate: Sample rate of a cube, in Hz: the median of all cubes.
+        edges_ns: (E,) times, in ns since the Unix epoch, that divide the bag into intervals. An
+            interval is a frame, or the time between two episodes. Interval i ends at edge i.
+        counts: (E + 1, cubes) number of samples of each cube in each frame; 0 between episodes.
+        usual: Median number of samples of a cube in a frame that has any.
         left_out: Numbers of samples and episodes that are not exported, by a text with the reason.
     """
 
     path: Path
     skin: Skin
     episodes: list[Episode]
-    rate: float
+    edges_ns: Times
+    counts: AnyArray
+    usual: float
     left_out: Counter[str]
 
+    def find_frames(self, stamp_ns: Times) -> Index:
+        """Return the number (N,) of the interval in which each of N stamps lies."""
+        return np.searchsorted(self.edges_ns, stamp_ns, side="right")
 
-def plan_bag(
-    path: Path,
-    choices: Choices,
-    report: Report,
-) -> BagPlan:
-    """Find the episodes (executions of a task) in a bag and count their samples.
+
+def plan_bag(path: Path, choices: Choices) -> BagPlan:
+    """Find the episodes and frames of a bag and count the samples in them.
 
     Args:
         path: Folder or file of the bag.
         choices: Frame rate, tasks and topics that the user chose.
-        report: Function that displays progress.
 
     Raises:
         BagError: The bag has no frequencies or no marks, its stamps are implausible, or the frame
             rate is above the sample rate, so that frames would have no sample.
     """
+    fps = choices.fps
     with open_bag(path, choices.frequencies) as source:
-        # The progress that is displayed is the fraction of the messages that have been read.
-        counts = {one.topic: one.msgcount for one in source.bag.connections}
-        total = counts[source.topic]
-        spans = [(MIN_NS, MAX_TIME_NS, choices.task)]
+        marks_ns, tasks = np.empty(0, np.int64), [choices.task]
         if choices.marks is not None:
-            spans = _find_marked_spans(source.bag, choices.marks)
-        n_cubes = len(source.skin.cubes)
+            marks_ns, tasks = _read_marks(source.bag, choices.marks)
+        first_ns = np.full(len(tasks), MAX_TIME_NS)
+        last_ns = -first_ns
+        for stamp_ns, cube in _read_samples(source):
+            known_ns = stamp_ns[cube < len(source.skin.cubes)]
+            index = np.searchsorted(marks_ns, known_ns, side="right")
+            np.minimum.at(first_ns, index, known_ns)
+            np.maximum.at(last_ns, index, known_ns)
+
         recorded_s = (source.bag.end_ns - source.bag.start_ns) / SECOND
-        max_frames = MAX_STAMP_RATIO * recorded_s * choices.fps + ALWAYS_ALLOWED_COUNT
-        episodes = [
-            Episode(
-                path,
-                span,
-                fps=choices.fps,
-                n_cubes=n_cubes,
-                max_frames=max_frames,
-            )
-            for span in spans
-        ]
+        max_frames = MAX_STAMP_RATIO * recorded_s * fps + ALWAYS_ALLOWED_COUNT
+        until_ns = np.append(marks_ns, MAX_TIME_NS)
+        episodes: list[Episode] = []
+        edges_ns = np.empty(0, np.int64)
+        seconds = 0.0
+        for mark in np.flatnonzero(first_ns <= last_ns):
+            if not tasks[mark]:
+                continue
+            begin_ns, end_ns = int(first_ns[mark]), int(last_ns[mark])
+            seconds += (end_ns - begin_ns) / SECOND
+            n_frames = (end_ns - begin_ns) * fps // SECOND + 1
+            if n_frames > max_frames:
+                raise BagError(
+                    f"{path}: a sample is stamped {seconds:.0f} s after the first of its episode, "
+                    "which is longer than was recorded: a clock was set; leave it out with --marks"
+                )
+            # Interval 0 lies before the first episode, and one interval follows each episode.
+            first = len(edges_ns) + 1
+            episodes.append(Episode(tasks[mark], begin_ns, range(first, first + n_frames)))
+            # Rounding up gives the first whole ns of each frame. A mark ends the last frame.
+            steps_ns = -(-np.arange(n_frames + 1) * SECOND // fps)
+            edges = np.minimum(begin_ns + steps_ns, until_ns[mark])
+            edges_ns = np.append(edges_ns, edges)
 
-        samples = np.zeros(n_cubes, np.int64)
-        first_ns, last_ns = MAX_TIME_NS, MIN_NS
-        for rows in source:
-            is_known = rows.cube < n_cubes
-            cube = rows.cube[is_known].astype(np.intp)
-            stamp_ns = rows.stamp_ns[is_known]
-            if len(cube):
-                samples += np.bincount(cube, minlength=n_cubes)
-                first_ns = min(first_ns, int(stamp_ns.min()))
-                last_ns = max(last_ns, int(stamp_ns.max()))
-                for episode in episodes:
-                    episode.count(cube, stamp_ns)
-            report(source.messages, total, f"counting {path}")
-
-    covered_s = (last_ns - first_ns) / SECOND
-    rate = _check_rate(source, samples, covered_s, choices.fps)
-    # Episodes without samples are left out. Often the last one begins just before the end of the
-    # recording.
-    used = [episode for episode in episodes if episode.rows]
-    for episode in used:
-        episode.finish()
-        _check_depth(source, episode, math.ceil(rate / choices.fps))
-    known_rows = int(samples.sum())
-    used_rows = sum(episode.rows for episode in used)
+        # The last column counts the samples of cubes that the skin does not have.
+        counts = np.zeros((len(edges_ns) + 1, len(source.skin.cubes) + 1), np.uint32)
+        for stamp_ns, cube in _read_samples(source):
+            frame = np.searchsorted(edges_ns, stamp_ns, side="right")
+            np.add.at(counts, (frame, cube), 1)
+    *known, unknown = counts.sum(axis=0).tolist()
+    between = [0, *(episode.frames.stop for episode in episodes)]
+    counts[between] = 0
+    used = counts[:, :-1]
     left_out = {
-        "samples outside of the marks": known_rows - used_rows,
-        "samples of cubes that the skin does not have": source.rows - known_rows,
-        "marks without a sample": len(episodes) - len(used),
+        "samples outside of the marks": sum(known) - int(used.sum()),
+        "samples of cubes that the skin does not have": unknown,
+        "marks without a sample": sum(map(bool, tasks)) - len(episodes),
     }
-    return BagPlan(
-        path,
-        source.skin,
-        used,
-        rate,
-        Counter(left_out),
-    )
+    usual = float(np.median(used[used > 0])) if episodes else 0.0
+    plan = BagPlan(path, source.skin, episodes, edges_ns, used, usual, Counter(left_out))
+    if choices.marks is None or episodes:
+        _check_rate(plan, seconds, fps)
+    return plan
 
 
-def _check_rate(
-    source: BagSource,
-    samples: Index,
-    seconds: float,
-    fps: int,
-) -> float:
-    """Return the sample rate of a bag and check that every frame can have a sample.
+def _read_samples(source: BagSource) -> Iterator[tuple[Times, Index]]:
+    """Yield stamps and cube indices of all samples; the index of unknown cubes is their number."""
+    n_cubes = len(source.skin.cubes)
+    for stamp_ns, cube in source.bag.columns(source.topic, frequency_codec, ("cube",)):
+        yield stamp_ns, np.minimum(cube, n_cubes).astype(np.intp)
+
+
+def _check_rate(plan: BagPlan, seconds: float, fps: int) -> None:
+    """Check that every frame can have a sample, and that no frame has far more than usual.
 
     Args:
-        source: Source of the recorded frequencies.
-        samples: (cubes,) number of samples of each cube.
-        seconds: Time between the first and the last stamp, in s.
+        plan: Episodes and frames of the bag.
+        seconds: Sum of the durations of the episodes, in s.
         fps: Frames per second.
 
-    Returns:
-        The sample rate of a cube, in Hz: the median of all cubes.
-
     Raises:
-        BagError: No cube has two samples, or the frame rate is above the sample rate.
+        BagError: No cube has two samples, the frame rate is above the sample rate, or a frame has
+            more samples than `MAX_DEPTH_RATIO` and `ALWAYS_ALLOWED_COUNT` allow.
     """
-    path = source.bag.path
-    # Cubes with fewer than two samples are left out: they have no rate, and a hub that was not
-    # connected would lower the median of all cubes.
-    several = samples[samples > 1]
+    # Cubes with fewer samples are left out: they have no rate, and a hub that was not connected
+    # would lower the median of all cubes. In each episode, n samples enclose n - 1 periods.
+    periods = plan.counts.sum(axis=0, dtype=np.int64) - len(plan.episodes)
+    several = periods[periods > 0]
     if not len(several) or seconds <= 0:
         raise BagError(
-            f"{path}: {samples.sum()} samples on {source.topic}, and no two of one cube; "
+            f"{plan.path}: {plan.counts.sum()} samples of frequencies, and no two of one cube; "
             "record longer"
         )
-    rate = float(np.median(several - 1)) / seconds
-    # n samples enclose only n - 1 sampling periods, so n frames can have one sample each even if
-    # the frame rate is higher than the sample rate by the factor 1 + 1/n.
-    fewest = int(several.min())
-    max_fps = math.floor(rate * (1 + 1 / fewest))
+    rate = float(np.median(several)) / seconds
+    # The n samples of n - 1 periods are enough for n frames.
+    max_fps = math.floor(rate * (1 + 1 / several.min()))
     if fps > max_fps:
         raise BagError(
-            f"{path}: --fps {fps}: the cubes were sampled {rate:.4g} times per second, so that "
-            f"frames would be without a sample; give at most {max_fps}"
+            f"{plan.path}: --fps {fps}: the cubes were sampled {rate:.4g} times per second, so "
+            f"that frames would be without a sample; give at most {max_fps}"
         )
-    return rate
-
-
-def _check_depth(
-    source: BagSource,
-    episode: Episode,
-    usual: int,
-) -> None:
-    """Check that no frame (time step of the data set) has far more samples than usual.
-
-    Every frame of the data set gets room for as many samples as the fullest frame has, so such a
-    frame would multiply the size of the data set.
-
-    Args:
-        source: Source of the recorded frequencies.
-        episode: Episode of the bag, with its numbers of samples.
-        usual: Number of samples of a cube in a frame that follows from the sample rate.
-
-    Raises:
-        BagError: A frame has more samples than `MAX_DEPTH_RATIO` and `ALWAYS_ALLOWED_COUNT` allow.
-    """
-    depth = int(episode.counts.max())
-    if depth > MAX_DEPTH_RATIO * usual + ALWAYS_ALLOWED_COUNT:
-        deepest = episode.counts.argmax()
-        frame, cube = np.unravel_index(deepest, episode.counts.shape)
+    depth = plan.counts.max()
+    if depth > MAX_DEPTH_RATIO * plan.usual + ALWAYS_ALLOWED_COUNT:
+        cube = plan.counts.max(axis=0).argmax()
         raise BagError(
-            f"{source.bag.path}: {depth} samples of cube {source.skin.names[cube]} in frame "
-            f"{frame}, usual are {usual}: stamps do not follow time; leave that time out with "
-            "--marks"
+            f"{plan.path}: {depth} samples of cube {plan.skin.names[cube]} in one frame, usual are "
+            f"{plan.usual:g}: stamps do not follow time; leave that time out with --marks"
         )
 
 
-def _find_marked_spans(
-    bag: Bag,
-    topic: str,
-) -> list[tuple[int, int, str]]:
-    """Return the episodes (executions of a task) into which marks divide a bag.
+def _read_marks(bag: Bag, topic: str) -> tuple[Times, list[str]]:
+    """Read the marks that divide a bag.
 
     A mark is a recorded text. At the time of its recording it ends the episode before and begins a
     new one, whose task is the text. An empty text only ends the episode before.
@@ -390,7 +255,8 @@ def _find_marked_spans(
         topic: Topic of the marks.
 
     Returns:
-        Begin (ns since the Unix epoch), end (ns) and task of each episode.
+        Time (M,) of recording of each mark, in ns since the Unix epoch. Text before the first mark,
+        which is empty, and of each mark.
 
     Raises:
         BagError: The topic does not exist, or none of its marks has a text.
@@ -400,14 +266,10 @@ def _find_marked_spans(
         raise BagError(
             f"{bag.path}: no marks ({MARK_TYPE}) on {topic}; topics of that type: {names}"
         )
-    marks = []
+    times_ns, tasks = [], [""]
     for time_ns, mark in bag.decoded({topic}):
-        marks.append((time_ns, mark.data.strip()))
-    end = (MAX_TIME_NS, "")
-    spans = []
-    for (since_ns, task), (until_ns, _) in pairwise([*marks, end]):
-        if task:
-            spans.append((since_ns, until_ns, task))
-    if not spans:
+        times_ns.append(time_ns)
+        tasks.append(mark.data.strip())
+    if not any(tasks):
         raise BagError(f"{bag.path}: no mark on {topic} begins an episode; publish its task there")
-    return spans
+    return np.array(times_ns), tasks

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter, itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -21,17 +21,18 @@ from ..bags.read import Bag, message_fields, stamp_ns
 from ..core.arrays import Single, Times
 from ..core.errors import BagError
 from ..messages.types import PACKAGE
-from .images import IMAGE_TYPES, ImageStream, Shape
-from .plan import Choices, Episode
+from .images import IMAGE_TYPES, LEAVE_OUT, ImageStream, Shape, encode
+from .plan import Choices
 
 if TYPE_CHECKING:
+    from rosbags.interfaces.typing import Fielddefs
     from sensor_msgs.msg import JointState
 
 JOINT_STATE_TYPE = "sensor_msgs/msg/JointState"
 """Message type of joint states: names, positions, velocities and efforts of a robot's joints."""
 
-HEADER_TYPE = "std_msgs/msg/Header"
-"""Message type of the header, which contains the stamp of a message."""
+HEADER_KIND = (Nodetype.NAME, "std_msgs/msg/Header")
+"""Kind of the field with the header, which contains the stamp of a message."""
 
 JOINT_FIELDS = ("position", "velocity", "effort")
 """Fields of a JointState message that have one number per joint."""
@@ -51,16 +52,16 @@ class Topic:
     Attributes:
         name: Name of the topic.
         msgtype: Type of its messages.
-        shape: Height, width and number of bands of its images; zeros for a topic of numbers.
-        names: Names of the numbers in a message, such as ``wrench.force.x``; empty for images.
         key: Name of the feature.
+        shape: Height, width and number of bands of its images; one pixel if there is no image.
+        names: Names of the numbers in all of its messages; empty for images.
     """
 
     name: str
     msgtype: str
-    shape: Shape = (0, 0, 0)
-    names: list[str] = field(default_factory=list)
-    key: str = ""
+    key: str
+    shape: Shape = (1, 1, 1)
+    names: dict[str, None] = field(default_factory=dict)
 
     @property
     def is_image(self) -> bool:
@@ -71,12 +72,12 @@ class Topic:
         """Read the messages in a bag, to extend `names` or, for images, to set `shape`."""
         if not self.is_image:
             # Bags may contain different joints, so the feature gets the joints of all bags.
-            names = dict.fromkeys(self.names)
             for _, numbers in _read_numbers(bag, self):
-                names |= dict.fromkeys(numbers)
-            self.names = list(names)
-        elif not any(self.shape):
-            self.shape = ImageStream(bag, self.name).shape
+                self.names |= dict.fromkeys(numbers)
+        elif self.shape == Topic.shape:
+            for _, message in bag.decoded({self.name}):
+                _, self.shape = encode(message, f"{bag.path}: {self.name}")
+                return
 
     def open(self, bag: Bag) -> ImageStream | Signal:
         """Read the topic's numbers in a bag, or prepare to read its images there.
@@ -102,50 +103,29 @@ class Signal:
         Raises:
             BagError: The bag is damaged, or a JointState has more or fewer values than joint names.
         """
-        messages = list(_read_numbers(bag, topic))
-        messages.sort(key=itemgetter(0))
-        stamps = [stamp for stamp, _ in messages]
-        self._stamp_ns: Times = np.array(stamps, np.int64)
-        # Row k + 1 of `_values` has the numbers that hold after message k; row 0 is NaN. A
-        # JointState may contain only some of the joints. The others keep their latest values, which
-        # are NaN until a message contains them.
+        messages = sorted(_read_numbers(bag, topic), key=itemgetter(0))
+        self._stamp_ns: Times = np.array([stamp for stamp, _ in messages], np.int64)
+        # Row k has the numbers that hold after k messages. A JointState may contain only some of
+        # the joints. The others keep their latest values, which are NaN until a message has them.
         latest = dict.fromkeys(topic.names, np.nan)
-        shape = (len(messages) + 1, len(latest))
-        self._values: Single = np.full(shape, np.nan, np.float32)
-        rows = self._values[1:]
-        for row, (_, numbers) in zip(rows, messages, strict=True):
+        self._values: Single = np.full((len(messages) + 1, len(latest)), np.nan, np.float32)
+        for row, (_, numbers) in enumerate(messages, 1):
             latest |= numbers
-            row[:] = list(latest.values())
+            self._values[row] = list(latest.values())
 
-    def at(
-        self,
-        episode: Episode,
-        first: int,
-        last: int,
-    ) -> Single:
-        """Return the newest values before the end of each of several successive frames.
+    def at(self, ends_ns: Times) -> Single:
+        """Return the newest values (frames, numbers) before the end of each frame.
+
+        They are NaN before the first message, and for numbers that the bag does not have.
 
         Args:
-            episode: Episode of the frames (time steps of the data set).
-            first: Number of the first frame in the episode.
-            last: Number of the frame after the last one.
-
-        Returns:
-            (frames, numbers) values; NaN before the first message, and for numbers that the bag
-            does not have.
+            ends_ns: (frames,) ends of frames, in ns since the Unix epoch.
         """
-        # The row for a frame (time step) is the number of messages with stamps up to its end.
-        frame_of_message = episode.frame_of(self._stamp_ns)
-        frames = np.arange(first, last)
-        row = np.searchsorted(frame_of_message, frames, side="right")
-        values: Single = self._values[row]
-        return values
+        n_before = np.searchsorted(self._stamp_ns, ends_ns)
+        return self._values[n_before]
 
 
-def find_topics(
-    paths: Sequence[Path],
-    choices: Choices,
-) -> list[Topic]:
+def find_topics(paths: Sequence[Path], choices: Choices) -> list[Topic]:
     """Find the topics of the bags that become features of a data set.
 
     Args:
@@ -157,22 +137,26 @@ def find_topics(
     """
     found: dict[str, Topic] = {}
     existing: set[str] = set()
-    named = choices.topics or ()
-    chosen = [*named, choices.state, choices.action]
-    wanted = {topic for topic in chosen if topic}
+    named = [*(choices.topics or ()), choices.state, choices.action]
+    wanted = {topic for topic in named if topic}
     for path in paths:
         with Bag(path) as bag:
             frequencies = choices.frequencies or f"{bag.skin_prefix()}frequencies"
-            prefix = frequencies.removesuffix("frequencies")
-            for name, msgtype in _find_stamped_topics(bag, prefix):
+            cubes = frequencies.removesuffix("frequencies") + "cubes/"
+            for one in sorted(bag.connections, key=attrgetter("topic")):
+                # The stress of the skin contains the same numbers as the topics of single cubes.
+                name, msgtype = one.topic, one.msgtype
+                if not one.msgcount or name.startswith(cubes) or not _is_usable(msgtype):
+                    continue
                 existing.add(name)
                 if choices.topics is not None and name not in wanted:
                     continue
-                topic = found.setdefault(name, Topic(name, msgtype))
+                kind = "images" if msgtype in IMAGE_TYPES else "topics"
+                key = f"observation.{kind}.{name.strip('/').replace('/', '.')}"
+                topic = found.setdefault(name, Topic(name, msgtype, key))
                 if topic.msgtype != msgtype:
                     raise BagError(
-                        f"{path}: {name} is {msgtype}, in other bags {topic.msgtype}; leave it out "
-                        "by naming the others with --topics"
+                        f"{path}: {name} is {msgtype}, in other bags {topic.msgtype}; {LEAVE_OUT}"
                     )
                 topic.describe(bag)
     missing = sorted(wanted - found.keys())
@@ -182,42 +166,26 @@ def find_topics(
             f"{', '.join(sorted(existing)) or 'none'}"
         )
     # JointState messages may contain no joints; such a topic has no numbers and is left out.
-    topics = found.values()
-    used = [topic for topic in topics if topic.names or topic.is_image]
-    joints = [topic.name for topic in used if topic.msgtype == JOINT_STATE_TYPE]
+    used: dict[str | None, Topic] = {
+        name: topic for name, topic in found.items() if topic.names or topic.is_image
+    }
+    joints = [name for name, topic in used.items() if topic.msgtype == JOINT_STATE_TYPE]
     # If there are several topics of joint states, only the user can decide which one is the state.
     others = [name for name in joints if name != choices.action]
-    state = choices.state
-    if state is None and len(others) == 1:
-        state = others[0]
-    for topic in used:
-        dotted = topic.name.strip("/").replace("/", ".")
-        kind = "images" if topic.is_image else "topics"
-        topic.key = f"observation.{kind}.{dotted}"
-        if topic.name == choices.action:
-            topic.key = ACTION_FEATURE
-        if topic.name == state:
-            topic.key = STATE_FEATURE
-    return used
+    state = choices.state or (others[0] if len(others) == 1 else None)
+    for chosen, key in ((choices.action, ACTION_FEATURE), (state, STATE_FEATURE)):
+        if chosen in used:
+            used[chosen].key = key
+    return list(used.values())
 
 
-def _read_numbers(
-    bag: Bag,
-    topic: Topic,
-) -> Iterator[tuple[int, dict[str, float]]]:
-    """Read the numbers in all messages on a topic, in the order of recording.
+def _is_usable(msgtype: str) -> bool:
+    """Return whether messages of a type can become a feature."""
+    return msgtype in (JOINT_STATE_TYPE, *IMAGE_TYPES) or bool(_number_paths(msgtype))
 
-    Args:
-        bag: Open bag.
-        topic: The topic: JointState, or another type with a header and numbers.
 
-    Yields:
-        Stamp of a message, in ns since the Unix epoch, and its numbers by their names, such as
-        ``elbow.position`` or ``wrench.force.x``.
-
-    Raises:
-        BagError: The bag is damaged, or a JointState has more or fewer values than joint names.
-    """
+def _read_numbers(bag: Bag, topic: Topic) -> Iterator[tuple[int, dict[str, float]]]:
+    """Yield the stamp, in ns, and the numbers by their names of each message on a topic."""
     paths = _number_paths(topic.msgtype)
     for _, message in bag.decoded({topic.name}):
         if topic.msgtype == JOINT_STATE_TYPE:
@@ -226,35 +194,11 @@ def _read_numbers(
             numbers = {}
             for path in paths:
                 value = attrgetter(path)(message)
-                if np.ndim(value) == 0:
+                if np.ndim(value):
+                    numbers |= {f"{path}.{k}": float(one) for k, one in enumerate(value)}
+                else:
                     numbers[path] = float(value)
-                    continue
-                for k, one in enumerate(value):
-                    numbers[f"{path}.{k}"] = float(one)
         yield stamp_ns(message), numbers
-
-
-def _find_stamped_topics(
-    bag: Bag,
-    skin: str,
-) -> list[tuple[str, str]]:
-    """Return name and type of the topics with images, joint states or other stamped numbers.
-
-    Topics of single cubes are left out, because the stress of the skin contains the same numbers.
-
-    Args:
-        bag: Open bag.
-        skin: Common prefix of the names of the skin's topics; those of single cubes have
-            ``cubes/`` after it.
-    """
-    found = []
-    for one in bag.connections:
-        is_of_cube = one.topic.startswith(f"{skin}cubes/")
-        is_known = one.msgtype in (JOINT_STATE_TYPE, *IMAGE_TYPES)
-        is_usable = is_known or _number_paths(one.msgtype)
-        if one.msgcount and is_usable and not is_of_cube:
-            found.append((one.topic, one.msgtype))
-    return sorted(found)
 
 
 def _number_paths(msgtype: str) -> list[str]:
@@ -264,20 +208,14 @@ def _number_paths(msgtype: str) -> list[str]:
     variable length, or belongs to this package.
     """
     fields = message_fields(msgtype)
-    if not fields or msgtype.startswith(PACKAGE):
+    if not fields or fields[0][1] != HEADER_KIND or msgtype.startswith(PACKAGE):
         return []
-    _, first = fields[0]
-    if first != (Nodetype.NAME, HEADER_TYPE):
-        return []
-    paths = list(_list_nested_paths(fields[1:], ""))
+    paths = list(_nested_paths(fields[1:], ""))
     return [] if None in paths else [path for path in paths if path]
 
 
-def _list_nested_paths(
-    fields: list[tuple[str, Any]],
-    prefix: str,
-) -> Iterator[str | None]:
-    """Yield the paths of the numbers in a message type, including those in nested messages.
+def _nested_paths(fields: Fielddefs, prefix: str) -> Iterator[str | None]:
+    """Yield the paths of the numbers in some fields, including those in nested messages.
 
     Args:
         fields: Name and kind of each field, as `message_fields` returns them.
@@ -285,26 +223,21 @@ def _list_nested_paths(
             fields of the outermost message itself.
 
     Yields:
-        Paths such as ``wrench.force.x``, of a number or of a list of numbers of fixed length; None
-        for a field of another kind, such as a list of variable length.
+        Path of a number or of a list of numbers of fixed length; None for a field of another kind,
+        such as a list of variable length.
     """
-    for name, (node, kind) in fields:
-        if node == Nodetype.NAME:
-            yield from _list_nested_paths(message_fields(kind), f"{prefix}{name}.")
-            continue
-        # For a list of fixed length, `kind` is a pair: (node and kind of an element, length).
-        if node == Nodetype.ARRAY:
-            node, kind = kind[0]
-        if node != Nodetype.BASE:
+    for name, field_kind in fields:
+        # For a list of fixed length, the second element of its kind is (kind of element, length).
+        kind = field_kind[1][0] if field_kind[0] == Nodetype.ARRAY else field_kind
+        if field_kind[0] == Nodetype.NAME:
+            yield from _nested_paths(message_fields(field_kind[1]), f"{prefix}{name}.")
+        elif kind[0] != Nodetype.BASE:
             yield None
-        elif kind[0] != "string":
+        elif kind[1][0] != "string":
             yield f"{prefix}{name}"
 
 
-def _find_joint_numbers(
-    message: JointState,
-    where: str,
-) -> dict[str, float]:
+def _find_joint_numbers(message: JointState, where: str) -> dict[str, float]:
     """Return the numbers in a JointState message by their names, such as ``elbow.position``.
 
     Args:
@@ -315,14 +248,14 @@ def _find_joint_numbers(
         BagError: The message has more or fewer values of a quantity than joint names.
     """
     numbers = {}
-    names = message.name
+    joints = message.name
     for quantity in JOINT_FIELDS:
         values = getattr(message, quantity)
-        if len(values) and len(values) != len(names):
+        if len(values) not in (0, len(joints)):
             raise BagError(
-                f"{where}: a message has {len(names)} joints and {len(values)} values of "
-                f"{quantity}; leave the topic out by naming the others with --topics"
+                f"{where}: a message has {len(joints)} joints and {len(values)} values of "
+                f"{quantity}; {LEAVE_OUT}"
             )
-        for name, value in zip(names, values, strict=False):
-            numbers[f"{name}.{quantity}"] = float(value)
+        for joint, value in zip(joints, values, strict=False):
+            numbers[f"{joint}.{quantity}"] = float(value)
     return numbers

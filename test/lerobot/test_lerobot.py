@@ -10,6 +10,7 @@ import json
 import os
 import shutil
 import subprocess
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -27,8 +28,8 @@ from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.modes import COMPONENTS
 from cube_tensor_driver.core.rows import StressRows
-from cube_tensor_driver.lerobot.statistics import Statistics
-from cube_tensor_driver.lerobot.windows import TACTILE, Windows
+from cube_tensor_driver.lerobot.statistics import describe, summarise
+from cube_tensor_driver.lerobot.windows import TACTILE, stream_windows
 from cube_tensor_driver.messages.types import INFO
 
 SKIN = package_data() / "config" / "skin_demo.yaml"
@@ -305,15 +306,10 @@ def test_windows_take_samples_in_any_order():
     depth = int(counts.max())
     value = random.normal(size=(4000, 15))
     rows = StressRows.of(cube, value[:, :6], value[:, 6:], sequence=np.arange(4000))
-    windows = Windows(counts, depth)
-    windows._block = 7
-    parts, begin = [], 0
-    while begin < 4000:
-        end = begin + int(random.integers(1, 60))
-        windows.add(frame[begin:end], rows.select(slice(begin, end)))
-        begin = end
-        parts += windows.complete()
-    assert windows.done == len(counts)
+    bounds = np.append(np.cumsum(random.integers(1, 60, 200)), 4000).clip(max=4000)
+    given = [(frame[i:j], rows.select(slice(i, j))) for i, j in pairwise([0, *bounds])]
+    blocks = [range(len(counts))[begin : begin + 7] for begin in range(0, len(counts), 7)]
+    parts = list(stream_windows(given, blocks, counts, depth))
     placed = np.concatenate([part[TACTILE] for part in parts])
     expected = np.full((len(counts), depth, 3, 15), np.nan, np.float32)
     for f in range(len(counts)):
@@ -326,10 +322,8 @@ def test_windows_take_samples_in_any_order():
 def test_statistics_of_parts_are_those_of_the_whole():
     values = np.random.default_rng(2).normal(1e6, 3, (5000, 2))
     values[::7, 0] = np.nan
-    statistics = Statistics(5000)
-    for part in np.split(values, 10):
-        statistics.add(part)
-    result = statistics.result()
+    every = np.ones(500, bool)
+    result = summarise([describe(part, every) for part in np.split(values, 10)], 5000)
     np.testing.assert_allclose(result["mean"], np.nanmean(values, axis=0), rtol=1e-12)
     np.testing.assert_allclose(result["std"], np.nanstd(values, axis=0), rtol=1e-6)
     np.testing.assert_array_equal(result["q90"], np.nanquantile(values, 0.9, axis=0))
