@@ -14,14 +14,13 @@ from rich.console import Console
 
 from cube_tensor_driver.config.calibration import (
     find_shipped_calibration,
-    read_calibration,
     write_calibration,
 )
 from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.core.arrays import Array
+from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.compensation.models import WeightModel
 from cube_tensor_driver.core.compensation.weight import STANDARD_GRAVITY
-from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.core.modes import COMPONENTS, STRESS
 from cube_tensor_driver.core.pipeline import Pipeline
@@ -30,6 +29,7 @@ from cube_tensor_driver.views.terminal.output import print_table, say
 
 from .fem.body import Body
 from .fem.fem import Response, make_calibration_from_fem
+from .fem.model import Model
 from .fem.volume_loads import ThermalStress, VolumeResponse
 from .studies.layout_study import DEPTH, LayoutStudy
 from .studies.surface_study import SurfaceRow, SurfaceStudy
@@ -144,32 +144,25 @@ def _show_convergence(result: Response) -> None:
     )
 
 
-def write(
-    path: Path,
-    result: Result,
-    command: str,
-    neglect: tuple[str, ...],
-    base: Path | None,
-) -> None:
+def write(path: Path, result: Result, command: str, model: Model) -> None:
     """Write the file of --output.
 
     Args:
         path: The file.
         result: The result.
         command: Command line that computes the result.
-        neglect: Names of modes that a calibration takes as zero.
-        base: Calibration to which a response to weight is added; None: the shipped one.
+        model: Model of the cube in its body.
     """
     if isinstance(result, Response):
-        _write_response(path, result, command, neglect)
+        _write_response(path, result, command, model.neglect)
     elif isinstance(result, SurfaceStudy):
         write_influence(path, result.influence, command)
         print(f"wrote {path}")
     elif isinstance(result, ThermalStress):
         write_yaml(path, result.to_dict(), f"Made by: {command} -o {path}\n{THERMAL_HEADER}")
         print(f"wrote {path}")
-    else:
-        _write_weight(path, result, command, base)
+    elif model.calibration is not None:
+        _write_weight(path, result, command, model.calibration)
 
 
 def _write_response(
@@ -272,22 +265,14 @@ def _write_weight(
     path: Path,
     result: VolumeResponse,
     command: str,
-    base: Path | None,
+    base: Calibration,
 ) -> None:
-    """Write the base calibration, by default the shipped one of the layout, with the response to
-    specific force."""
-    body, layout = result.body, result.layout
-    old = read_calibration(base) if base else find_shipped_calibration(layout)
-    if old is None or not old.layout.same_as(layout):
-        raise ConfigError(
-            f"--base: the weight is that of a cube with the layout {layout.name!r}, and "
-            f"{'no calibration is shipped' if old is None else 'the calibration is not'} for it; "
-            "name a calibration of the same layout"
-        )
-    calibration = replace(old, weight=WeightModel(result.pads))
+    """Write a calibration of the layout with the response to specific force."""
+    body = result.body
+    calibration = replace(base, weight=WeightModel(result.pads))
     header = (
         f"Made by: {command} -o {path}\n"
-        f"The block weight is computed: {describe(body, layout)} on rigid ground, densities "
+        f"The block weight is computed: {describe(body, result.layout)} on rigid ground, densities "
         f"{body.density:g} and {body.cube_density:g} kg/m³."
     )
     write_calibration(path, calibration, header)
@@ -305,7 +290,7 @@ def draw(result: Result, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     body, layout = result.body, result.layout
     if isinstance(result, SurfaceStudy):
-        figure = draw_influence(result.influence, layout, body.side / 2)
+        figure = draw_influence(result.influence)
         save(figure, folder / "influence.png")
     elif isinstance(result, Response):
         save(draw_convergence(result), folder / "convergence.png")

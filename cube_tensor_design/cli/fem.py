@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cube_tensor_driver.cli.parser import Parser
@@ -14,16 +13,9 @@ from cube_tensor_driver.cli.parser import Parser
 if TYPE_CHECKING:
     from ..fem.model import Model
 
-COMPUTATIONS = {
-    "surface": "bond the lower face to rigid ground, and compute the influence functions of the "
-    "pads: their stress under forces on the upper face",
-    "temperature": "bond the lower face to rigid ground, take the width as the pitch of the cubes, "
-    "and compute the stress of the pads per K, because the elastomer expands",
-    "weight": "bond the lower face to rigid ground, take the width as the pitch of the cubes, and "
-    "compute the stress of the pads by weight and inertia, from the densities in the model",
-}
-"""Option that asks for another computation than the response to linear stress fields -> its help
-text."""
+LOADS = ("modes", "surface", "temperature", "weight")
+"""Names of the loads under which the stress of the pads is computed. `modes` are linear stress
+fields on the outer faces of the body. Under the others the lower face is bonded to rigid ground."""
 DEFAULT_MESHES = 3
 """Number of meshes, from coarse to fine, that are computed without the option --meshes."""
 
@@ -37,20 +29,20 @@ def add_arguments(parser: Parser) -> None:
         help="YAML file of geometry and material, or the name of a shipped one in config/fem "
         "(default: a planar steel cube of 4 mm in a section of 60 x 11 mm)",
     )
-    for name, text in COMPUTATIONS.items():
-        parser.add_argument(f"--{name}", action="store_true", help=text)
     parser.add_argument(
-        "--base",
-        type=Path,
-        metavar="FILE",
-        help="calibration to which --weight adds its result (default: the shipped one of the "
-        "layout)",
+        "--load",
+        choices=LOADS,
+        default=LOADS[0],
+        help="compute the stress of the pads under linear stress fields, which is their response; "
+        "under forces on the upper face (influence functions); under a temperature of 1 K; or "
+        "under a specific force of 1 m/s². All but the first bond the lower face to rigid ground, "
+        "and the last two take the width as the pitch of the cubes (default: %(default)s)",
     )
     parser.add_output(
         "-o",
         "--output",
-        help="write the calibration (.yaml), with --surface the influence functions (.npz), or "
-        "with --temperature the thermal stress for the simulator (.yaml)",
+        help="write the calibration (.yaml); of the load surface the influence functions (.npz), "
+        "of temperature the thermal stress for the simulator (.yaml)",
     )
     parser.add_output(
         "--figures",
@@ -83,19 +75,19 @@ def run(options: argparse.Namespace) -> int:
     model = read_model(options.model)
     _check_options(options, model)
     body, layout, meshes = model.body, model.layout, options.meshes
-    is_on_ground = options.surface or options.temperature or options.weight
-    place = " on rigid ground" if is_on_ground else ""
-    symmetry = "" if is_on_ground else f", symmetry {model.symmetry}"
+    place, symmetry = " on rigid ground", ""
+    if options.load == "modes":
+        place, symmetry = "", f", symmetry {model.symmetry}"
     cube = reports.describe(body, layout)
     print(f"{cube}{place}; {layout.n_pads} pads{symmetry}", flush=True)
     result: reports.Result
     # The factorisation runs in C, where Ctrl-C would not be noticed.
     with ends_at_once(), progress_bar() as report:
-        if options.surface:
+        if options.load == "surface":
             result = study_surface(body, layout, meshes, model.neglect, report)
-        elif options.temperature:
+        elif options.load == "temperature":
             result = compute_thermal_stress(body, layout, meshes, report)
-        elif options.weight:
+        elif options.load == "weight":
             result = compute_weight(body, layout, meshes, report)
         else:
             result = compute_response(body, layout, model.symmetry, meshes, report)
@@ -105,31 +97,30 @@ def run(options: argparse.Namespace) -> int:
     if options.figures is not None:
         reports.draw(result, options.figures)
     if options.output is not None:
-        command = _command(options)
-        reports.write(options.output, result, command, model.neglect, options.base)
+        reports.write(options.output, result, _command(options), model)
     return 0
 
 
 def _check_options(options: argparse.Namespace, model: Model) -> None:
-    """Raise ConfigError before any work if options exclude each other, or -o names a file that
-    cannot hold what is computed."""
+    """Raise ConfigError before any work if there are no pictures of the load, or -o names a file
+    that cannot hold what is computed."""
     from cube_tensor_driver.config.output_files import check_yaml
     from cube_tensor_driver.core.errors import ConfigError
 
-    chosen = [f"--{name}" for name in COMPUTATIONS if getattr(options, name)]
-    if len(chosen) > 1:
-        raise ConfigError(f"{' and '.join(chosen)} are different computations; give one of them")
-    if options.base is not None and not options.weight:
-        raise ConfigError("--base is for --weight, which adds its result to a calibration")
-    if options.figures is not None and (options.temperature or options.weight):
-        raise ConfigError(f"--figures: there are no pictures of {chosen[0]}; leave it out")
+    if options.figures is not None and options.load in ("temperature", "weight"):
+        raise ConfigError(f"--figures: there are no pictures of {options.load}; leave it out")
     path = options.output
-    if path is not None and not options.surface:
+    if path is not None and options.load == "weight" and model.calibration is None:
+        raise ConfigError(
+            f"-o {path}: the weight is added to a calibration, and none is shipped for the layout "
+            f"{model.layout.name!r}; name one in the model (calibration: FILE)"
+        )
+    if path is not None and options.load != "surface":
         check_yaml("-o", path)
     elif path is not None and path.suffix != ".npz":
         raise ConfigError(
-            f"-o {path}: with --surface it is a file of influence functions, which ends in .npz; "
-            "name one, or leave out --surface for a calibration"
+            f"-o {path}: with --load surface it is a file of influence functions, which ends in "
+            ".npz; name one, or leave out --load for a calibration"
         )
     elif path is not None and model.layout.planar:
         raise ConfigError(
@@ -144,7 +135,8 @@ def _command(options: argparse.Namespace) -> str:
     # Only what changes the result; the default number of meshes is left out.
     if options.model is not None:
         words.append(options.model)
-    words += [f"--{name}" for name in COMPUTATIONS if getattr(options, name)]
+    if options.load != LOADS[0]:
+        words += ["--load", options.load]
     if options.meshes != DEFAULT_MESHES:
         words += ["--meshes", str(options.meshes)]
     return shlex.join(words)

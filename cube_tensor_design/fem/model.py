@@ -14,8 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cube_tensor_driver.config.calibration import find_named_layout
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.calibration import (
+    find_calibration,
+    find_named_layout,
+    find_shipped_calibration,
+    read_calibration,
+)
+from cube_tensor_driver.config.package_data import find_shipped
 from cube_tensor_driver.config.schema import (
     TEXT,
     Schema,
@@ -24,6 +29,7 @@ from cube_tensor_driver.config.schema import (
     real,
 )
 from cube_tensor_driver.config.yaml import read_yaml
+from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.errors import (
     ConfigError,
     CubeError,
@@ -83,6 +89,7 @@ _SCHEMA = Schema(
             "symmetry": _SYMMETRY,
             "plane": _PLANE,
             "neglect": _MODES,
+            "calibration": TEXT,
             "body": mapping((), _BODY),
             "cube": mapping((), _CUBE),
             "pads": mapping((), _PADS),
@@ -101,26 +108,15 @@ class Model:
         layout: Pads of the cube.
         symmetry: Symmetry group whose coefficients describe the response.
         neglect: Names of modes (linear stress fields) that the calibration takes as zero.
+        calibration: Calibration to which a computed response to weight is added; None: the
+            shipped one of the layout, if there is one.
     """
 
     body: Body
     layout: Layout
     symmetry: str
     neglect: tuple[str, ...]
-
-
-def find_model(name: str) -> Path:
-    """Return the path of a model: a shipped one by its name, or else a file.
-
-    Raises:
-        ConfigError: There is neither. The message lists the shipped models.
-    """
-    shipped = package_data() / "config" / "fem"
-    for path in (shipped / f"{name}.yaml", Path(name)):
-        if path.is_file():
-            return path
-    names = ", ".join(sorted(path.stem for path in shipped.glob("*.yaml")))
-    raise ConfigError(f"no model {name!r}; name a YAML file, or one of the shipped: {names}")
+    calibration: Calibration | None
 
 
 def read_model(name: str | None) -> Model:
@@ -132,7 +128,7 @@ def read_model(name: str | None) -> Model:
     """
     if name is None:
         return _build_model({}, Path())
-    path = find_model(name)
+    path = find_shipped("fem/*.yaml", name, Path(), "a model file, or one of the shipped models")
     data = read_yaml(path) or {}
     for _, mistake in _SCHEMA.mistakes(data):
         raise ConfigError(f"{path}: {mistake}")
@@ -143,8 +139,8 @@ def read_model(name: str | None) -> Model:
 
 
 def _build_model(data: Mapping[str, Any], folder: Path) -> Model:
-    """Build a model from the checked content of its file; layout files are looked up in
-    `folder`."""
+    """Build a model from the checked content of its file; other files that it names are looked up
+    in `folder`."""
     name = str(data.get("layout", DEFAULT_LAYOUT))
     is_file = name.endswith((".yaml", ".yml"))
     layout = find_named_layout(str(folder / name) if is_file else name)
@@ -161,7 +157,11 @@ def _build_model(data: Mapping[str, Any], folder: Path) -> Model:
     # Both calls raise an error for a name that does not fit the layout, before any work.
     find_structure(layout, symmetry)
     default_modes(layout).index(neglect)
-    return Model(body, layout, symmetry, neglect)
+    calibration = find_shipped_calibration(layout)
+    if "calibration" in data:
+        calibration = read_calibration(find_calibration(data["calibration"], folder))
+        calibration.check(layout)
+    return Model(body, layout, symmetry, neglect, calibration)
 
 
 def _build_body(data: Mapping[str, Any]) -> Body:

@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from cube_tensor_driver.core.arrays import Array
-from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.mechanics.influence import Influence
 from cube_tensor_driver.views.figures.style import (
     SIGNED_COLOURS,
@@ -48,12 +47,8 @@ def draw_convergence(result: Response) -> Figure:
     shown = sorted(values, key=lambda name: -abs(values[name]))[:MAX_COEFFICIENTS]
     for number, name in enumerate(shown):
         change = np.array([row["coefficients"][name] - values[name] for row in coarser])
-        axis.loglog(
-            unknowns,
-            100 * abs(change) / largest,
-            label=name,
-            **choose_curve_style(number),
-        )
+        (curve,) = axis.loglog(unknowns, 100 * abs(change) / largest, label=name)
+        curve.set(**choose_curve_style(number))
     label = f"distance from the result with {finest['unknowns']} unknowns / % of the largest"
     axis.set(xlabel="unknowns of the mesh", ylabel=label)
     # A single mesh has nothing to compare it with.
@@ -62,11 +57,7 @@ def draw_convergence(result: Response) -> Figure:
         axis.xaxis.set_minor_formatter(NullFormatter())
         axis.yaxis.set_major_formatter("{x:g}")
         axis.yaxis.set_minor_formatter("{x:.2g}")
-        axis.legend(
-            fontsize="small",
-            ncol=2,
-            handlelength=4,
-        )
+        axis.legend(fontsize="small", ncol=2, handlelength=4)
     return figure
 
 
@@ -80,13 +71,8 @@ def draw_response(result: Response) -> Figure:
     figure = Figure(figsize=(0.6 * n_modes + 2.5, 0.35 * n_pads + 1.5))
     axis = figure.subplots()
     limit = np.abs(result.matrix).max()
-    image = axis.imshow(
-        result.matrix,
-        cmap=SIGNED_COLOURS,
-        vmin=-limit,
-        vmax=limit,
-        aspect="auto",
-    )
+    image = axis.imshow(result.matrix, cmap=SIGNED_COLOURS, aspect="auto")
+    image.set_clim(-limit, limit)
     axis.grid(False)
     labels = [symbol(mode) for mode in result.modes]
     axis.set_xticks(range(n_modes), labels, rotation=60 if n_modes > 7 else 0)
@@ -96,37 +82,22 @@ def draw_response(result: Response) -> Figure:
         if abs(value) > MIN_LABELLED * limit:
             # The colour map is dark below zero.
             color = "black" if value > -0.1 * limit else "white"
-            axis.text(
-                mode,
-                pad,
-                f"{value:.2f}",
-                ha="center",
-                va="center",
-                fontsize=7,
-                color=color,
-            )
+            text = f"{value:.2f}"
+            axis.text(mode, pad, text, ha="center", va="center", fontsize=7, color=color)
     figure.colorbar(image, ax=axis, label="pad stress over amplitude of the mode / (Pa/Pa)")
     return figure
 
 
 @print_style()
-def draw_influence(
-    influence: Influence,
-    layout: Layout,
-    half_side: float,
-) -> Figure:
+def draw_influence(influence: Influence) -> Figure:
     """Draw the stress of each pad over the place of a force along x, above the cube's centre line.
 
     There is a panel for each direction of the force. Pads with the same curve share one.
-
-    Args:
-        influence: The influence functions.
-        layout: Pads of the cube.
-        half_side: Half side of the cube, in m.
     """
+    layout = influence.layout
     # The picture ends where the influence functions end.
     ends = influence.place[[0, -1], 0]
-    reach = min(REACH * half_side, *np.abs(ends))
+    reach = min(REACH * influence.side / 2, *np.abs(ends))
     x = np.linspace(-reach, reach, POINTS)
     along_x = np.eye(influence.place.shape[1])[0]
     forces = influence.at(x[:, None] * along_x)
@@ -137,12 +108,11 @@ def draw_influence(
     figure = Figure(figsize=(10, 4.5))
     titles = (f"a force of {force} pressing", f"a force of {force} along x")
     groups = _find_equal_curves(stress)
-    for axis, title, direction in zip(figure.subplots(1, 2), titles, stress.T, strict=True):
-        curves = {}
-        for pads in groups:
-            # The factor 1e3 is undone by draw_curves, which draws Pa as kPa.
-            label = ", ".join(layout.pads[pad] for pad in pads)
-            curves[label] = 1e3 * direction[:, pads[0]] / unit
+    labels = [", ".join(layout.pads[pad] for pad in pads) for pads in groups]
+    # The factor 1e3 is undone by draw_curves, which draws Pa as kPa.
+    shown = 1e3 / unit * stress[[pads[0] for pads in groups]].T
+    for axis, title, direction in zip(figure.subplots(1, 2), titles, shown, strict=True):
+        curves = dict(zip(labels, direction.T, strict=True))
         draw_curves(axis, x, curves, spacing=20)
         axis.set(
             xlabel="place of the force from the cube's centre, x / mm",

@@ -24,8 +24,8 @@ def find_influence(name: str) -> Path:
         ConfigError: The package has no file of this name and the path leads to no file.
     """
     advice = (
-        "a file of influence functions that ./cube fem MODEL --surface -o FILE.npz made, or one of "
-        "the shipped"
+        "a file of influence functions that ./cube fem MODEL --load surface -o FILE.npz made, "
+        "or one of the shipped"
     )
     return find_shipped(
         "influence/*.npz",

@@ -323,7 +323,7 @@ CONTACTS = (
         "",
         "Table of influence functions (response of each pad to a unit force at points of the "
         "surface), for the method inverse. It is the name of a table in the package, or a file "
-        "made by `./cube fem MODEL --surface`. The table then replaces the parameters depth, "
+        "made by `./cube fem MODEL --load surface`. The table then replaces the parameters depth, "
         "thickness and poisson. With an empty text each cube is taken as a point in a homogeneous "
         "elastomer.",
         problem=find_influence_problem,

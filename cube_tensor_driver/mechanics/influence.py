@@ -159,13 +159,14 @@ def read_influence(path: Path) -> Influence:
         _check(influence)
     except FileNotFoundError:
         raise ConfigError(
-            f"{path}: no such file; make it with ./cube fem MODEL --surface"
+            f"{path}: no such file; make it with ./cube fem MODEL --load surface"
         ) from None
     except (CubeError, *_PARSE_ERRORS) as error:
         # A KeyError contains only the name of the missing array.
         reason = f"no {error}" if isinstance(error, KeyError) else error
         raise ConfigError(
-            f"{path}: {reason}; make the file again with ./cube fem MODEL --surface -o FILE.npz"
+            f"{path}: {reason}; make the file again with ./cube fem MODEL --load surface "
+            "-o FILE.npz"
         ) from None
     return influence
 

@@ -137,7 +137,7 @@ class Imperfections:
         air: Times in s and temperatures in °C of the air above the skin, which also changes
             linearly between them. Empty: the air keeps the first temperature of the ground.
         heat_exchange: Heat exchange of the surface with the air, in W/(m² K).
-        thermal_stress: File, written by `./cube fem --temperature -o`, with the layer and the
+        thermal_stress: File, written by `./cube fem --load temperature -o`, with the layer and the
             stress of the pads in it, or the name of such a file in the package.
         pad_drift: Mean relative change of the rest frequency (frequency without load) of a pad per
             K, because of its electronics.
@@ -146,8 +146,8 @@ class Imperfections:
         poses: Times in s, positions in m, and roll, pitch, yaw in rad of the parent frame of the
             skin in the world, whose z axis points up. Between two poses each number follows half a
             period of a cosine. Empty: cubes and elastomer weigh nothing.
-        weight: File, written by `./cube fem --weight -o`, with the stress of the pads per specific
-            force, or the name of such a file in the package.
+        weight: File, written by `./cube fem --load weight -o`, with the stress of the pads per
+            specific force, or the name of such a file in the package.
         seed: Seed of the random numbers that determine the deviation of each pad.
 
     Raises:

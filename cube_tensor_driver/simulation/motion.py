@@ -9,8 +9,8 @@ measures the specific force, acceleration minus gravity::
     s = (R C)^T (d²(p + R r)/dt² + g z)
 
 with the gravitational acceleration g and the unit vector z of the world. The stress of the pads is
-linear in s. Finite elements (`./cube fem --weight`) have computed it from the densities of cube and
-elastomer.
+linear in s. Finite elements (`./cube fem --load weight`) have computed it from the densities of
+cube and elastomer.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ def read_weight(name: str, n_pads: int) -> Array:
     """Return the stress of the pads per specific force (P, 3), in Pa per m/s².
 
     Args:
-        name: File that `./cube fem --weight -o` has written, or the name of one in the package.
+        name: File that `./cube fem --load weight -o` has written, or the name of one in the
+            package.
         n_pads: Number of pads P that the cubes have.
 
     Raises:
@@ -47,13 +48,13 @@ def read_weight(name: str, n_pads: int) -> Array:
         "weight/*.yaml",
         name,
         Path(),
-        "a file of ./cube fem --weight",
+        "a file of ./cube fem --load weight",
     )
     model = read_calibration(path).weight
     if model is None or model.n_pads != n_pads:
         raise ConfigError(
-            f"{path}: no weight of cubes with {n_pads} pads; compute it with ./cube fem --weight "
-            "for their layout"
+            f"{path}: no weight of cubes with {n_pads} pads; compute it with ./cube fem --load "
+            "weight for their layout"
         )
     return model.response
 

@@ -10,10 +10,10 @@ temperature at the height z above the ground is T(z, t)::
 
 Finite volumes turn this into a linear system, whose eigenvectors are advanced exactly under
 temperatures of ground and air that are linear in time. The thermal stress of a pad is linear in
-T(z); finite elements (`./cube fem --temperature`) have computed it for Legendre polynomials. The
-oscillators of a cube have the mean temperature of the layer between the lower and the upper face of
-the cube. The conduction of heat along the layer, and into the cubes, which conduct better than the
-elastomer, is left out.
+T(z); finite elements (`./cube fem --load temperature`) have computed it for Legendre polynomials.
+The oscillators of a cube have the mean temperature of the layer between the lower and the upper
+face of the cube. The conduction of heat along the layer, and into the cubes, which conduct better
+than the elastomer, is left out.
 
 Source: H. S. Carslaw, J. C. Jaeger, Conduction of Heat in Solids (1959), 3.11.
 """
@@ -47,7 +47,7 @@ the error of the temperature in the layer is below 2e-3 of the step."""
 
 
 class ThermalLayer(NamedTuple):
-    """Layer with cubes, as a file of `./cube fem --temperature` describes it.
+    """Layer with cubes, as a file of `./cube fem --load temperature` describes it.
 
     Attributes:
         height: Height of the layer, in m.
@@ -70,7 +70,7 @@ def read_thermal_stress(name: str, n_pads: int) -> ThermalLayer:
     Raises:
         ConfigError: There is no such file, or it has another number of pads.
     """
-    advice = "a file of ./cube fem --temperature"
+    advice = "a file of ./cube fem --load temperature"
     data = read_yaml(
         find_shipped(
             "thermal/*.yaml",
@@ -89,12 +89,12 @@ def read_thermal_stress(name: str, n_pads: int) -> ThermalLayer:
         )
     except (KeyError, TypeError, ValueError) as error:
         raise ConfigError(
-            f"{name}: {error} does not suit; ./cube fem --temperature -o writes a file"
+            f"{name}: {error} does not suit; ./cube fem --load temperature -o writes a file"
         ) from None
     if pads.ndim != 2 or len(pads) != n_pads:
         raise ConfigError(
             f"{name}: thermal stress of shape {pads.shape}, the cubes have {n_pads} pads; compute "
-            "it with ./cube fem --temperature for their layout"
+            "it with ./cube fem --load temperature for their layout"
         )
     return layer
 

@@ -125,7 +125,7 @@ def _match_pads(influence: Influence, calibration: Calibration) -> list[int]:
         raise ElasticError(
             f"the influence functions are of a cube of {1e3 * influence.side:g} mm and calibration "
             f"{calibration.id} of one of {1e3 * side:g} mm; make them again with "
-            f"./cube fem MODEL --surface, with side: {side:g} in the model"
+            f"./cube fem MODEL --load surface, with side: {side:g} in the model"
         )
 
     same_size = abs(given.pad_size - layout.pad_size) <= _MATCH_TOLERANCE
@@ -144,7 +144,7 @@ def _match_pads(influence: Influence, calibration: Calibration) -> list[int]:
         if difference[nearest] > _MATCH_TOLERANCE or not same_size:
             raise ElasticError(
                 f"the influence functions have no pad like {name} of layout {layout.name!r}; make "
-                "them again with ./cube fem MODEL --surface for this layout"
+                "them again with ./cube fem MODEL --load surface for this layout"
             )
         matches.append(nearest)
     return matches

@@ -43,7 +43,7 @@ ELSEWHERE = {
     "./cube check socket://127.0.0.1:5331": (
         "test_firmware.test_hubs_keep_every_rule_on_real_lines"
     ),
-    "./cube fem cube_11mm --surface --meshes 2 -o mine.npz": (
+    "./cube fem cube_11mm --load surface --meshes 2 -o mine.npz": (
         "test_fem_command.test_pads_under_loads_on_the_surface"
     ),
     "./cube record -o run1": "test_recording.test_recorded_is_published_and_reprocessed_is_live",

@@ -73,7 +73,7 @@ RESPONSE = np.array(
     ]
 )
 """Stress of each pad of a steel bar per specific force along x, y and z, in Pa per m/s², from
-./cube fem planar_slab --weight."""
+./cube fem planar_slab --load weight."""
 TRUE_RESPONSE = np.array(
     [
         [3.447, 0, -3.469],

@@ -220,7 +220,7 @@ def test_a_file_that_is_none(changes, words, tmp_path):
     path.write_bytes(b"PK but no more" if changes is None else damaged(whole, **changes))
     with pytest.raises(ConfigError, match=words) as error:
         read_influence(path)
-    assert str(path) in str(error.value) and "--surface" in str(error.value)
+    assert str(path) in str(error.value) and "--load surface" in str(error.value)
 
 
 def test_each_damaged_byte_names_file_and_fix(influence, tmp_path):
@@ -238,7 +238,7 @@ def test_each_damaged_byte_names_file_and_fix(influence, tmp_path):
         with contextlib.suppress(ConfigError):
             read_influence(path)
             continue
-        with pytest.raises(ConfigError, match=r"bad\.npz.*--surface"):
+        with pytest.raises(ConfigError, match=r"bad\.npz.*--load surface"):
             read_influence(path)
 
 

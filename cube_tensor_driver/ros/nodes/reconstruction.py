@@ -158,8 +158,8 @@ class Reconstruction(CubeNode):
             if calibration.weight is None:
                 self.get_logger().warning(
                     f"cube {cube.name}: weight is not compensated, as its calibration "
-                    f"{calibration.id} has no response to it: ./cube fem or ./cube fit "
-                    "--weight computes it"
+                    f"{calibration.id} has no response to it: ./cube fem --load weight or "
+                    "./cube fit --weight computes it"
                 )
                 break
 
