@@ -5,8 +5,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cube_tensor_driver.core.arrays import Array
@@ -14,11 +14,11 @@ from cube_tensor_driver.views.figures.style import choose_curve_style
 
 
 def draw_curves(
-    axis: Any,
+    axis: Axes,
     x: Array,
     curves: Mapping[str, Array],
     spacing: int = 1,
-    **style: Any,
+    **style: object,
 ) -> None:
     """Draw curves in kPa or kHz over positions in mm, each in a style of its own.
 
@@ -32,7 +32,8 @@ def draw_curves(
     """
     for number, (label, values) in enumerate(curves.items()):
         own_style = choose_curve_style(number) | {"markevery": (4 * number % spacing, spacing)}
-        axis.plot(1e3 * x, 1e-3 * values, label=label, **own_style | style)
+        (curve,) = axis.plot(1e3 * x, 1e-3 * values, label=label)
+        curve.set(**own_style | style)
 
 
 def add_legend_below(figure: Figure) -> None:

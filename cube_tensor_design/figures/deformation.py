@@ -4,14 +4,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.tri import LinearTriInterpolator, Triangulation
 
-from cube_tensor_driver.core.arrays import Array
+from cube_tensor_driver.core.arrays import Array, Mask
 from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.views.figures.style import SIGNED_COLOURS, print_style, symbol
 
@@ -83,73 +82,62 @@ def draw_loads(layout: Layout, deformations: dict[str, Deformation]) -> Figure:
     return figure
 
 
-def _draw_pads(axis: Any, layout: Layout, half_side: float) -> None:
+def _draw_pads(axis: Axes, layout: Layout, half_side: float) -> None:
     """Draw pads on the faces of an undeformed cube whose half side is `half_side` mm."""
     centres = layout.positions[:, [0, 2]]
-    normals = layout.normals[:, [0, 2]]
-    for centre, normal in zip(centres, normals, strict=True):
-        along_face = layout.pad_size * (1 - np.abs(normal))
-        ends = centre + np.outer((-0.5, 0.5), along_face)
-        x, z = half_side * ends.T
-        axis.plot(x, z, color="tab:red", linewidth=5, solid_capstyle="butt")
+    # A pad is as long as its size along the face, which is across its normal.
+    halves = layout.pad_size / 2 * (1 - np.abs(layout.normals[:, [0, 2]]))
+    x, z = half_side * np.stack([centres - halves, centres + halves], axis=-1).swapaxes(0, 1)
+    axis.plot(x.T, z.T, color="tab:red", linewidth=5, solid_capstyle="butt")
 
 
-def _draw_deformation(axis: Any, deformation: Deformation, window: float) -> float:
+def _draw_deformation(axis: Axes, deformation: Deformation, window: float) -> float:
     """Draw σzz on the deformed body within `window` d0, the cube, and displacements as arrows.
 
     Returns:
         Scale of the displacements.
     """
-    d0 = deformation.half_side
+    mm = 1e3 * deformation.half_side
     points = deformation.points
     moved = deformation.displacement
     # Displacements far away are large and not drawn.
     is_near = np.abs(points[0]) < window
-    distances = np.hypot(*moved[:, is_near])
-    scale = MAX_DISPLACEMENT * d0 / distances.max()
-    drawn = 1e3 * (d0 * points + scale * moved)
-    _draw_stress(axis, deformation, drawn, window)
+    largest = np.hypot(*moved[:, is_near]).max()
+    scale = float(MAX_DISPLACEMENT * deformation.half_side / largest)
+    drawn = mm * points + 1e3 * scale * moved
+    _draw_stress(axis, deformation, drawn, is_near)
     _draw_arrows(axis, deformation, window)
 
     # The cube before the deformation is dotted, and after it white.
-    side = 2e3 * d0
-    lower_left = (-side / 2, -side / 2)
-    square = Rectangle(lower_left, side, side, fill=False, linestyle=":", linewidth=0.8)
+    square = Rectangle((-mm, -mm), 2 * mm, 2 * mm, fill=False, linestyle=":", linewidth=0.8)
     axis.add_patch(square)
-    ring = np.abs(points).max(axis=0)
-    face = np.flatnonzero(np.isclose(ring, 1))
+    face = np.flatnonzero(np.isclose(np.abs(points).max(axis=0), 1))
     x, z = points[:, face]
-    by_angle = np.argsort(np.arctan2(z, x))
-    outline = drawn[:, face[by_angle]]
+    outline = drawn[:, face[np.argsort(np.arctan2(z, x))]]
     axis.fill(*outline, facecolor="white", edgecolor="black", linewidth=1.2)
 
-    half_width = 1e3 * d0 * window
-    half_height = min(half_width, 600 * deformation.height)
-    axis.set_xlim(-half_width, half_width)
-    axis.set_ylim(-half_height, half_height)
-    axis.set(aspect="equal", ylabel=r"$z$ / mm")
+    half_height = min(mm * window, 600 * deformation.height)
+    limits = {"xlim": (-mm * window, mm * window), "ylim": (-half_height, half_height)}
+    axis.set(aspect="equal", ylabel=r"$z$ / mm", **limits)
     axis.grid(False)
-    return float(scale)
+    return scale
 
 
-def _draw_stress(axis: Any, deformation: Deformation, drawn: Array, window: float) -> None:
+def _draw_stress(axis: Axes, deformation: Deformation, drawn: Array, is_near: Mask) -> None:
     """Draw σzz of the elastomer as colours and contour lines on the points `drawn` (2, n), mm.
 
-    The colour scale follows the stress within `window` d0 of the cube.
+    The colour scale follows the stress of the points that are near the cube.
     """
-    points = deformation.points
-    ring = np.abs(points).max(axis=0)
-    largest_coordinate = ring[deformation.triangles].max(axis=0)
-    is_outside = largest_coordinate > 1 + 1e-9
+    from_cube = np.abs(deformation.points).max(axis=0)
+    is_outside = from_cube[deformation.triangles].max(axis=0) > 1 + 1e-9
     triangles = deformation.triangles[:, is_outside]
 
     # The value of a node is the mean of the triangles around it.
     stress = np.tile(deformation.stress_zz[is_outside] / 1e3, 3)
-    total = np.bincount(triangles.ravel(), stress, len(ring))
-    count = np.bincount(triangles.ravel(), minlength=len(ring))
+    total = np.bincount(triangles.ravel(), stress, len(from_cube))
+    count = np.bincount(triangles.ravel(), minlength=len(from_cube))
     kilopascal = total / np.maximum(count, 1)
-    is_near = (np.abs(points[0]) < window) & (ring >= 1)
-    magnitude = np.abs(kilopascal[is_near])
+    magnitude = np.abs(kilopascal[is_near & (from_cube >= 1)])
     limit = np.percentile(magnitude, COLOUR_PERCENTILE)
 
     mesh = Triangulation(drawn[0], drawn[1], triangles.T)
@@ -157,34 +145,30 @@ def _draw_stress(axis: Any, deformation: Deformation, drawn: Array, window: floa
     image.set_clim(-limit, limit)
     # matplotlib dashes the lines below zero.
     lines = axis.tricontour(mesh, kilopascal, limit * CONTOURS, colors="black", linewidths=0.7)
-    colorbar = axis.figure.colorbar(image, ax=axis, label=r"$\sigma_{zz}$ / kPa (dashed: negative)")
+    label = r"$\sigma_{zz}$ / kPa (dashed: negative)"
+    colorbar = axis.figure.colorbar(image, ax=axis, label=label)
     colorbar.add_lines(lines)
 
 
-def _draw_arrows(axis: Any, deformation: Deformation, window: float) -> None:
+def _draw_arrows(axis: Axes, deformation: Deformation, window: float) -> None:
     """Draw the displacements at the points of a regular grid within `window` d0 of the cube.
 
     The longest arrow is as long as d0.
     """
-    d0 = deformation.half_side
+    mm = 1e3 * deformation.half_side
     # Arrows at the edges of the picture would leave it.
-    body_half_height = deformation.height / 2 / d0
+    body_half_height = deformation.height / 2 / deformation.half_side
     half_height = min(window - 1, body_half_height - 0.5)
     columns = np.linspace(1 - window, window - 1, ARROW_COLUMNS)
     rows = np.linspace(-half_height, half_height, ARROW_ROWS)
-    x, z = np.meshgrid(columns, rows)
-    node_x, node_z = deformation.points
-    mesh = Triangulation(node_x, node_z, deformation.triangles.T)
-    moved = []
-    for along in deformation.displacement:
-        interpolate = LinearTriInterpolator(mesh, along)
-        moved.append(interpolate(x, z))
-    longest = np.hypot(*moved).max()
-    arrows = 1e3 * d0 * np.array(moved) / longest
-    tails = 1e3 * d0 * np.array([x, z])
+    tails = np.array(np.meshgrid(columns, rows))
+    x, z = deformation.points
+    mesh = Triangulation(x, z, deformation.triangles.T)
+    moved = [LinearTriInterpolator(mesh, along)(*tails) for along in deformation.displacement]
+    arrows = moved / np.hypot(*moved).max()
     axis.quiver(
-        *tails,
-        *arrows,
+        *(mm * tails),
+        *(mm * arrows),
         color="black",
         edgecolor="white",
         linewidth=0.3,

@@ -5,9 +5,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cube_tensor_driver.core.modes import PLANE
@@ -52,8 +52,8 @@ rounding errors of values that are zero by symmetry, and are not shown."""
 def draw_experiment(result: Experiment, law: str) -> Figure:
     """Draw frequencies and prototype signals as in Figs. 7 and 8, beside stress and gradient.
 
-    C1 and C2 are on the lower face; a dashed line is P_shear with both on the upper face. Stress
-    and gradient are recovered from eight pads (full lines) or true (dashed).
+    C1 and C2 are on the lower face; a dashed line is P_shear with both on the upper face, which has
+    the other sign. Stress and gradient are recovered from eight pads (full lines) or true (dashed).
 
     Args:
         result: The experiment.
@@ -67,7 +67,7 @@ def draw_experiment(result: Experiment, law: str) -> Figure:
     pads.set(title="frequencies", ylabel="frequency / kHz")
     by_label = dict(zip(SIGNAL_LABELS, result.prototype.T, strict=True))
     draw_curves(signals, x, by_label, linestyle="-")
-    upper = {UPPER_LABEL: result.upper[:, 1]}
+    upper = {UPPER_LABEL: -result.prototype[:, 1]}
     draw_curves(signals, x, upper, color="tab:red", linestyle="--", marker="")
     signals.set(title="prototype, eqs. 8 to 10", ylabel="signal / kHz")
     _draw_modes(stress, result, slice(3))
@@ -83,20 +83,16 @@ def draw_experiment(result: Experiment, law: str) -> Figure:
     return figure
 
 
-def _draw_modes(
-    axis: Any,
-    result: Experiment,
-    modes: slice,
-) -> None:
+def _draw_modes(axis: Axes, result: Experiment, modes: slice) -> None:
     """Draw recovered and true amplitudes of some modes (linear stress fields) of the plane."""
-    names = PLANE.names[modes]
     recovered = result.recovered[:, modes]
     truth = result.truth[:, modes]
-    labelled = {symbol(name): values for name, values in zip(names, recovered.T, strict=True)}
-    draw_curves(axis, result.displacement, labelled, linestyle="-")
+    labels = [symbol(name) for name in PLANE.names[modes]]
     # matplotlib puts no label with an underscore into the legend.
-    hidden = {f"_{name}": values for name, values in zip(names, truth.T, strict=True)}
-    draw_curves(axis, result.displacement, hidden, linestyle="--")
+    hidden = [f"_{label}" for label in labels]
+    x = result.displacement
+    draw_curves(axis, x, dict(zip(labels, recovered.T, strict=True)), linestyle="-")
+    draw_curves(axis, x, dict(zip(hidden, truth.T, strict=True)), linestyle="--")
     # Rounding errors of modes that are zero must not fill a panel.
     floor = MIN_SHOWN_SHARE * np.abs(result.recovered).max()
     if np.abs([recovered, truth]).max() < floor:
@@ -148,7 +144,7 @@ def draw_prototype(experiments: Sequence[Experiment]) -> Figure:
     for (upper, lower), experiment in zip(axes.T, experiments, strict=True):
         normal, shear, gradient = experiment.prototype.T
         names = (*SIGNAL_LABELS[1:], UPPER_LABEL)
-        curves = (shear, gradient, experiment.upper[:, 1])
+        curves = (shear, gradient, -shear)
         # P_normal is some thirty times as large as the others, which have an axis of their own.
         draw_curves(upper, experiment.displacement, {SIGNAL_LABELS[0]: normal})
         draw_curves(lower, experiment.displacement, dict(zip(names, curves, strict=True)))

@@ -5,10 +5,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
+from matplotlib.collections import TriMesh
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.views.figures.style import choose_curve_style, print_style
@@ -33,7 +34,7 @@ def draw_methods(example: FieldExample, prefix: str = "") -> Figure:
         prefix: Words before the name of each method.
     """
     figure = Figure(figsize=(9, 3.3))
-    axes = _map_axes(figure, 1, len(example.pressure))
+    axes = _make_map_panels(figure, 1, len(example.pressure))
     truth = example.pressure["truth"]
     maps = {}
     for name, pressure in example.pressure.items():
@@ -41,13 +42,7 @@ def draw_methods(example: FieldExample, prefix: str = "") -> Figure:
         title = f"{prefix}{name}\nrms error {100 * share:.0f} %"
         maps[name if name == "truth" else title] = pressure
     image = _draw_maps(axes[0], example, maps)
-    figure.colorbar(
-        image,
-        ax=axes,
-        label=PRESSURE_LABEL,
-        shrink=0.8,
-    )
-    _add_legend(axes[0, 0])
+    figure.colorbar(image, ax=axes, label=PRESSURE_LABEL, shrink=0.8)
     return figure
 
 
@@ -59,7 +54,7 @@ def draw_traction(example: FieldExample) -> Figure:
     errors over that of the pressure.
     """
     figure = Figure(figsize=(9, 5.6))
-    axes = _map_axes(figure, 2, 3)
+    axes = _make_map_panels(figure, 2, 3)
     truth = example.pressure["truth"]
     predicted = example.pressure["standard deviation"]
 
@@ -78,7 +73,6 @@ def draw_traction(example: FieldExample) -> Figure:
     image = _draw_maps(axes.flat[4:], example, errors)
     # A colour bar of the whole row keeps the columns of both rows aligned.
     figure.colorbar(image, ax=axes[1], label="error and predicted\ndeviation / kPa")
-    _add_legend(axes[0, 0])
     return figure
 
 
@@ -87,84 +81,39 @@ def relative_rms(values: Array, reference: Array) -> float:
     return float(np.linalg.norm(values) / np.linalg.norm(reference))
 
 
-def _map_axes(
-    figure: Figure,
-    rows: int,
-    columns: int,
-) -> Any:
+def _make_map_panels(figure: Figure, rows: int, columns: int) -> NDArray[np.object_]:
     """Return panels (rows, columns) for maps of the same square, with labels at the outer ones."""
-    axes = figure.subplots(
-        rows,
-        columns,
-        sharex=True,
-        sharey=True,
-        squeeze=False,
-    )
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    view = (-VIEW_MM, VIEW_MM)
     for axis in axes.flat:
-        axis.set(
-            aspect="equal",
-            xlim=(-VIEW_MM, VIEW_MM),
-            ylim=(-VIEW_MM, VIEW_MM),
-            xlabel="$x$ / mm",
-            ylabel="$y$ / mm",
-        )
+        axis.set(aspect="equal", xlim=view, ylim=view, xlabel="$x$ / mm", ylabel="$y$ / mm")
         axis.grid(False)
         axis.label_outer()
     return axes
 
 
 def _draw_maps(
-    axes: Any,
+    axes: NDArray[np.object_],
     example: FieldExample,
     maps: Mapping[str, Array],
-) -> Any:
+) -> TriMesh:
     """Draw maps (M,) in Pa by their title, with cubes and load, from 0 to the largest of all."""
     x, y = 1e3 * example.points[:, :2].T
+    cubes = 1e3 * example.cubes[:, :2].T
+    load = 1e3 * example.centre
     top = 1e-3 * max(values.max() for values in maps.values())
     levels = np.arange(CONTOUR_STEP_KPA / 2, top, CONTOUR_STEP_KPA)
     for axis, (title, values) in zip(axes, maps.items(), strict=True):
         # A method may compute tension, which no contact makes.
         kilopascal = 1e-3 * np.maximum(values, 0)
-        image = axis.tripcolor(
-            x,
-            y,
-            kilopascal,
-            vmin=0,
-            vmax=top,
-            shading="gouraud",
-            rasterized=True,
-        )
+        image: TriMesh = axis.tripcolor(x, y, kilopascal, vmin=0, vmax=top, shading="gouraud")
+        image.set_rasterized(True)
         axis.tricontour(x, y, kilopascal, levels=levels, colors="white", linewidths=0.5)
-        cubes = 1e3 * example.cubes[:, :2].T
-        load = 1e3 * example.centre
-        axis.plot(
-            *cubes,
-            "s",
-            ms=4,
-            mfc="none",
-            mec="0.8",
-            label="cube",
-        )
-        axis.plot(
-            *load,
-            "P",
-            ms=7,
-            mfc="red",
-            mec="white",
-            mew=0.8,
-            label="load",
-        )
+        axis.plot(*cubes, "s", ms=4, mfc="none", mec="0.8", label="cube")
+        axis.plot(*load, "P", ms=7, mfc="red", mec="white", mew=0.8, label="load")
         axis.set_title(title)
+    axes[0].legend(fontsize=7, loc="lower left", facecolor="0.3", labelcolor="white")
     return image
-
-
-def _add_legend(axis: Any) -> None:
-    axis.legend(
-        fontsize=7,
-        loc="lower left",
-        facecolor="0.3",
-        labelcolor="white",
-    )
 
 
 @print_style()

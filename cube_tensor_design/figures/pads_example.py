@@ -4,10 +4,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
@@ -16,10 +15,7 @@ from matplotlib.patches import Rectangle
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.layout import Layout
-from cube_tensor_driver.views.figures.style import (
-    SIGNED_COLOURS,
-    print_style,
-)
+from cube_tensor_driver.views.figures.style import SIGNED_COLOURS, print_style
 
 from ..studies.pads_example import BALL_X, LOAD, Sweep, make_simple_loads
 from .curves import draw_curves
@@ -45,13 +41,12 @@ def draw_pads(calibration: Calibration) -> Figure:
     # One scale for all loads.
     limit = np.abs(pads).max()
     colours = ScalarMappable(Normalize(-limit, limit), colormaps[SIGNED_COLOURS])
-    for column, (title, state) in enumerate(loads.items()):
-        by_mode = dict(zip(calibration.modes.names, state, strict=True))
-        _draw_load(axes[0, column], by_mode)
-        _draw_frame(axes[0, column], title)
-        _draw_cube(axes[1, column], calibration.layout, pads[column], colours)
-        _draw_frame(axes[1, column], "stress of the pads / kPa")
-        axes[1, column].set_xlabel("$x\\,/\\,d_0$")
+    for (above, below), (title, state), values in zip(axes.T, loads.items(), pads, strict=True):
+        _draw_load(above, dict(zip(calibration.modes.names, state, strict=True)))
+        _draw_frame(above, title)
+        _draw_cube(below, calibration.layout, values, colours)
+        _draw_frame(below, "stress of the pads / kPa")
+        below.set_xlabel("$x\\,/\\,d_0$")
     for axis in axes[:, 0]:
         axis.set_ylabel("$z\\,/\\,d_0$")
     # A colour bar of both rows keeps their columns aligned.
@@ -60,48 +55,26 @@ def draw_pads(calibration: Calibration) -> Figure:
     return figure
 
 
-def _draw_load(axis: Any, state: dict[str, float]) -> None:
+def _draw_load(axis: Axes, state: dict[str, float]) -> None:
     """Draw the forces that the surroundings exert on the faces of a square around the cube."""
-    scale = ARROW_LENGTH / abs(LOAD)
-    for side in (1, -1):
+    arrows = []
+    for side in (1.0, -1.0):
         for x in ARROWS:
             # The stress grows with x / d0 by its gradient times d0.
-            length = scale * abs(state["zz"] + state["zz_x"] * x)
+            stress = abs(state["zz"] + state["zz_x"] * x)
+            length = ARROW_LENGTH * stress / abs(LOAD)
             if length > 0.1:
-                _draw_arrow(axis, (x, side * (1 + length)), (x, side))
+                arrows.append(((x, side * (1 + length)), (x, side)))
         # Shear on one face needs shear on the other ones, or the square would turn.
         if state["zx"]:
-            near = 1.15 * side
-            far = 0.9 * side
-            _draw_arrow(axis, (-far, near), (far, near))
-            _draw_arrow(axis, (near, -far), (near, far))
+            near, far = 1.15 * side, 0.9 * side
+            arrows += [((-far, near), (far, near)), ((near, -far), (near, far))]
+    style = {"arrowstyle": "-|>", "color": "tab:blue", "shrinkA": 0, "shrinkB": 0}
+    for tail, tip in arrows:
+        axis.annotate("", xy=tip, xytext=tail, arrowprops=style)
 
 
-def _draw_arrow(
-    axis: Any,
-    tail: tuple[float, float],
-    tip: tuple[float, float],
-) -> None:
-    style = {
-        "arrowstyle": "-|>",
-        "color": "tab:blue",
-        "shrinkA": 0,
-        "shrinkB": 0,
-    }
-    axis.annotate(
-        "",
-        xy=tip,
-        xytext=tail,
-        arrowprops=style,
-    )
-
-
-def _draw_cube(
-    axis: Any,
-    layout: Layout,
-    pads: Array,
-    colours: ScalarMappable,
-) -> None:
+def _draw_cube(axis: Axes, layout: Layout, pads: Array, colours: ScalarMappable) -> None:
     """Draw pads on the section of the cube in the colour and with the number of their stress."""
     centres = layout.positions[:, [0, 2]]
     normals = layout.normals[:, [0, 2]]
@@ -110,35 +83,14 @@ def _draw_cube(
         corner = centre + PAD_THICKNESS / 2 * normal - size / 2
         axis.add_patch(Rectangle(corner, *size, fc=colours.to_rgba(value), ec="black"))
         text = f"{value:.1f}".replace("-", "−")
-        axis.text(
-            *(centre + 0.55 * normal),
-            text,
-            ha="center",
-            va="center",
-            fontsize=8,
-        )
+        x, z = centre + 0.55 * normal
+        axis.text(x, z, text, ha="center", va="center", fontsize=8)
 
 
-def _draw_frame(axis: Any, title: str) -> None:
-    axis.add_patch(
-        Rectangle(
-            (-1, -1),
-            2,
-            2,
-            fc="0.93",
-            ec="black",
-            zorder=0.5,
-        )
-    )
-    ticks = (-1, 0, 1)
-    axis.set(
-        xlim=(-2, 2),
-        ylim=(-2, 2),
-        xticks=ticks,
-        yticks=ticks,
-        aspect="equal",
-        title=title,
-    )
+def _draw_frame(axis: Axes, title: str) -> None:
+    axis.add_patch(Rectangle((-1, -1), 2, 2, fc="0.93", ec="black", zorder=0.5))
+    limits = {"xlim": (-2, 2), "ylim": (-2, 2), "xticks": (-1, 0, 1), "yticks": (-1, 0, 1)}
+    axis.set(aspect="equal", title=title, **limits)
     axis.grid(False)
 
 

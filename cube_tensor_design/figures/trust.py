@@ -4,9 +4,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
@@ -39,26 +38,20 @@ def draw_trust(result: LayoutStudy) -> Figure:
     rows = len(result.sides)
     columns = len(result.error)
     figure = Figure(figsize=(4 * columns, 3 * rows))
-    axes = figure.subplots(
-        rows,
-        columns,
-        sharex=True,
-        sharey=True,
-        squeeze=False,
-    )
-    for column, (name, error) in enumerate(result.error.items()):
-        for row, side in enumerate(result.sides):
-            _draw_errors(axes[row][column], 1e3 * result.widths, error[row])
-            axes[row][column].set_title(f"layout {name}, side {1e3 * side:g} mm")
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for by_side, (name, error) in zip(axes.T, result.error.items(), strict=True):
+        for axis, side, errors in zip(by_side, result.sides, error, strict=True):
+            _draw_errors(axis, 1e3 * result.widths, errors)
+            axis.set_title(f"layout {name}, side {1e3 * side:g} mm")
     # NaN is a component that the layout does not observe.
-    smallest = min(float(np.nanmin(error)) for error in result.error.values())
-    axes[0][0].set_ylim(0.7 * smallest, MAX_SHOWN_ERROR)
+    smallest = np.nanmin(list(result.error.values()))
+    axes[0, 0].set_ylim(0.7 * smallest, MAX_SHOWN_ERROR)
 
-    handles, labels = axes[0][-1].get_legend_handles_labels()
+    handles, labels = axes[0, -1].get_legend_handles_labels()
     handles.append(Patch(facecolor="0.92", edgecolor="0.7"))
     labels.append(f"error above {100 * MAX_TRUSTED_ERROR:g} %:\nnot to be trusted")
     # The legend is no higher than a panel, or the layout would move the rows apart.
-    axes[0][-1].legend(
+    axes[0, -1].legend(
         handles,
         labels,
         loc="upper left",
@@ -73,21 +66,17 @@ def draw_trust(result: LayoutStudy) -> Figure:
     return figure
 
 
-def _draw_errors(
-    axis: Any,
-    widths: Array,
-    errors: Array,
-) -> None:
+def _draw_errors(axis: Axes, widths: Array, errors: Array) -> None:
     """Draw one panel: errors (W, C) over widths (W,) in mm."""
     axis.axhspan(MAX_TRUSTED_ERROR, 100, color="0.92")
     for number, component in enumerate(COMPONENTS):
         is_observed = not np.isnan(errors[0, number])
         if is_observed:
-            style = _choose_component_style(number)
-            axis.loglog(widths, errors[:, number], label=symbol(component), **style)
+            (curve,) = axis.loglog(widths, errors[:, number], label=symbol(component))
+            curve.set(**_choose_component_style(number))
 
 
-def _choose_component_style(number: int) -> dict[str, Any]:
+def _choose_component_style(number: int) -> dict[str, object]:
     """Return the style of a component: six stresses, then the gradients xx_x, xx_y, xx_z, ..."""
     if number < len(STRESS):
         return choose_curve_style(number) | {"linestyle": "-"}

@@ -11,7 +11,7 @@ pads' foam either; `FOAM_MODULUS` is ours.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 
@@ -25,7 +25,7 @@ from cube_tensor_driver.core.modes import PLANE
 from cube_tensor_driver.core.oscillator import pad_frequency
 
 from ..fem.body import Body
-from ..fem.fem import Progress, Response, compute_response, count_steps
+from ..fem.fem import Progress, compute_response, count_steps
 from .rod import Rod
 from .virtual_bench import Deformation, LoadStep, VirtualBench
 
@@ -36,9 +36,6 @@ MODE_AMPLITUDE = 1e4
 ON_LOWER = [2, 3, 0, 1]
 """Columns of the planar layout's pads V1 .. V8 that are the prototype's pads C1 .. C4, if C1 and C2
 are on the lower face."""
-ON_UPPER = [0, 1, 2, 3]
-"""Columns of the planar layout's pads V1 .. V8 that are the prototype's pads C1 .. C4, if C1 and C2
-are on the upper face."""
 SHEAR_SIGNS = np.array([-1.0, 1.0, 1.0, -1.0])
 """Signs with which the frequency changes of the prototype's pads C1 .. C4 are added to its signal
 for shear, P_shear (the paper's eq. 9)."""
@@ -59,7 +56,6 @@ class Experiment:
         pads: (n, 8) stress of the pads, in Pa.
         prototype: (n, 3) signals P_normal, P_shear, P_grad of the paper's prototype, in Hz, with
             its pads C1 and C2 on the lower face.
-        upper: (n, 3) the same signals with C1 and C2 on the upper face.
         recovered: (n, 7) amplitudes of the plane modes (linear stress fields) that all eight pads
             give, in Pa.
         truth: (n, 7) amplitudes of the plane modes in the body without a cube, in Pa.
@@ -70,19 +66,9 @@ class Experiment:
     displacement: Array
     pads: Array
     prototype: Array
-    upper: Array
     recovered: Array
     truth: Array
     rotation: Array
-
-
-@dataclass(frozen=True, eq=False)
-class _Protocol:
-    """Name and steps of an experiment; displacement (n,) of the plate or rod that moves, in m."""
-
-    name: str
-    displacement: Array
-    steps: list[LoadStep]
 
 
 def experiments(
@@ -99,17 +85,38 @@ def experiments(
             before it.
     """
     body = Body()
-    protocols = _protocols(body)
+    both = np.concatenate([DISPLACEMENTS, 3e-3 + DISPLACEMENTS])
+    # The displacements (n,) and the steps of each experiment.
+    protocols = {
+        "b, pressed 3 mm then sheared, bonded": (both, _press_and_shear(body, bonded=True)),
+        "b, pressed 3 mm by sliding plates that then grip, sheared": (
+            both,
+            _press_and_shear(body, bonded=False),
+        ),
+        "c, 5 mm rod above C2, bonded bottom": (DISPLACEMENTS, _press_rod(body, bonded=True)),
+        "c, 5 mm rod above C2, sliding bottom": (DISPLACEMENTS, _press_rod(body, bonded=False)),
+    }
     # The cube is calibrated in the same body, which has the symmetry of a slab.
     calibration = compute_response(body, LAYOUTS["planar"], "slab", meshes=1)
+    to_modes = estimate_modes(calibration.matrix, PLANE).matrix.T
     # Every step is solved with the cube and without it.
-    total = 2 * sum(len(protocol.steps) for protocol in protocols)
+    total = 2 * sum(len(steps) for _, steps in protocols.values())
     report = count_steps(progress, total)
-    found = [
-        # Every step reports the name of its experiment.
-        _run_experiment(protocol, body, finite, calibration, partial(report, protocol.name))
-        for protocol in protocols
-    ]
+    benches = [VirtualBench(body, cube=cube, finite=finite) for cube in (True, False)]
+    found = []
+    for name, (displacement, steps) in protocols.items():
+        with_cube, without = (bench.run(steps, partial(report, name)) for bench in benches)
+        frequency = foam_frequency(with_cube.pads)
+        experiment = Experiment(
+            name=name,
+            displacement=displacement,
+            pads=with_cube.pads,
+            prototype=prototype(frequency[:, ON_LOWER]),
+            recovered=with_cube.pads @ to_modes,
+            truth=without.state,
+            rotation=with_cube.rotation,
+        )
+        found.append(experiment)
     # Experiment (a) is the first half of experiment (b).
     bonded, sliding = found[:2]
     return [
@@ -119,22 +126,13 @@ def experiments(
     ]
 
 
-def _protocols(body: Body) -> list[_Protocol]:
-    both = np.concatenate([DISPLACEMENTS, 3e-3 + DISPLACEMENTS])
-    rods = [Rod(depth, body.side / 4) for depth in DISPLACEMENTS]
-    protocols = []
-    for bonded, name in (
-        (True, "b, pressed 3 mm then sheared, bonded"),
-        (False, "b, pressed 3 mm by sliding plates that then grip, sheared"),
-    ):
-        pressing = [plates(body, depth, bonded=bonded) for depth in DISPLACEMENTS]
-        shearing = [plates(body, 3e-3, x, gripped=not bonded) for x in DISPLACEMENTS]
-        protocols.append(_Protocol(name, both, pressing + shearing))
-    for bonded, bottom in ((True, "bonded"), (False, "sliding")):
-        dents = [dent(body, rod, bonded) for rod in rods]
-        name = f"c, 5 mm rod above C2, {bottom} bottom"
-        protocols.append(_Protocol(name, DISPLACEMENTS, dents))
-    return protocols
+def _press_and_shear(body: Body, bonded: bool) -> list[LoadStep]:
+    pressing = [plates(body, depth, bonded=bonded) for depth in DISPLACEMENTS]
+    return pressing + [plates(body, 3e-3, x, gripped=not bonded) for x in DISPLACEMENTS]
+
+
+def _press_rod(body: Body, bonded: bool) -> list[LoadStep]:
+    return [dent(body, Rod(depth, body.side / 4), bonded) for depth in DISPLACEMENTS]
 
 
 def _take_first_half(experiment: Experiment, name: str) -> Experiment:
@@ -143,30 +141,6 @@ def _take_first_half(experiment: Experiment, name: str) -> Experiment:
     count = len(DISPLACEMENTS)
     columns = {key: value[:count] for key, value in vars(experiment).items()}
     return Experiment(**columns | {"name": name})
-
-
-def _run_experiment(
-    protocol: _Protocol,
-    body: Body,
-    finite: bool,
-    calibration: Response,
-    report: Callable[[], None],
-) -> Experiment:
-    bench = VirtualBench(body, finite=finite)
-    empty_bench = VirtualBench(body, cube=False, finite=finite)
-    with_cube = bench.run(protocol.steps, report)
-    without = empty_bench.run(protocol.steps, report)
-    frequency = foam_frequency(with_cube.pads)
-    return Experiment(
-        name=protocol.name,
-        displacement=protocol.displacement,
-        pads=with_cube.pads,
-        prototype=prototype(frequency[:, ON_LOWER]),
-        upper=prototype(frequency[:, ON_UPPER]),
-        recovered=with_cube.pads @ estimate_modes(calibration.matrix, PLANE).matrix.T,
-        truth=without.state,
-        rotation=with_cube.rotation,
-    )
 
 
 def foam_frequency(pads: Array) -> Array:

@@ -18,8 +18,7 @@ balance, one to four for each order, after G. V. Kolosov, with z = x + i y and y
 
     2 mu u = k a zⁿ - n z conj(a zⁿ⁻¹) - conj(b zⁿ)        k = (lam + 3 mu) / (lam + mu)
 
-n = 1: uniform stress, of which Im b is shear; 2: gradients; 3: second derivatives of stress. The
-signal of each follows from one solve with the adjoint.
+n = 1: uniform stress, of which Im b is shear; 2: gradients; 3: second derivatives of stress.
 
 Sources: N. I. Muskhelishvili, Some Basic Problems of the Mathematical Theory of Elasticity (1953),
 32; T. Mura, Micromechanics of Defects in Solids (1987), 22 (equivalent inclusion).
@@ -177,36 +176,39 @@ def split_signals(
     free = bench.free(step)
     matrix = _superpose_matrix(bench, step, with_cube, u, field)
     solver = factorise(matrix)
-    dofs = np.unique(bench.section.basis.element_dofs[:, in_cube])
-    polynomials, part = _make_polynomials(bench)
-    polynomials = polynomials[:, dofs]
-    # Columns of equal norm keep the fit well conditioned.
-    size = np.linalg.norm(polynomials, axis=1)
-    scaled = polynomials / size[:, None]
-    scaled_amplitude, *_ = np.linalg.lstsq(scaled.T, field[dofs], rcond=None)
-    amplitude = scaled_amplitude / size
-
     rows = []
-    for weights in signals:
-        adjoint = np.zeros_like(u)
-        # The signal depends on w, the displacement that the cube adds. Instead of solving for the
-        # w of each polynomial, the transposed (symmetric) system is solved once, with the weights
-        # of the signal on the right. The matrix has one row more if the rod's force is held.
-        n_free = len(free)
-        forces = _compute_forces(bench, weights, ~in_cube)
+    for own in _split_field(bench, field):
+        # The nodal forces of the elastomer in the cube's place, which the cube replaces.
+        replaced = _compute_forces(empty, own, in_cube)
+        loads = replaced - _compute_forces(bench, own, in_cube)
+        # The matrix has one row more if the rod's force is held.
         right = np.zeros(matrix.shape[0])
-        right[:n_free] = -forces[free]
-        adjoint[free] = solver.solve(right)[:n_free]
-        # The signal is the product of `response` and the displacements without the cube (`field`).
-        response = _compute_forces(empty, weights + adjoint, in_cube)
-        response -= _compute_forces(bench, adjoint, in_cube)
-        per_amplitude = polynomials @ response[dofs]
-        each = per_amplitude * amplitude
-        parts = np.bincount(part, each, len(PARTS))
-        # The residual of the fit by polynomials belongs to the higher derivatives.
-        parts[-1] += response @ field - each.sum()
-        rows.append(parts)
-    return np.array(rows)
+        right[: len(free)] = loads[free]
+        added = np.zeros_like(u)
+        added[free] = solver.solve(right)[: len(free)]
+        # The field is in balance, so the elastomer around the cube bears `replaced`, too.
+        on_cube = replaced - _compute_forces(bench, added, ~in_cube)
+        rows.append([weights @ on_cube for weights in signals])
+    return np.transpose(rows)
+
+
+def _split_field(bench: VirtualBench, field: Array) -> Array:
+    """Return the parts (5, dofs), by `PARTS`, of the displacements (dofs,) in the cube's place.
+
+    Outside of this place they mean nothing.
+    """
+    dofs = np.unique(bench.section.basis.element_dofs[:, bench.in_cube])
+    polynomials, part = _make_polynomials(bench)
+    # Columns of equal norm keep the fit well conditioned.
+    polynomials /= np.linalg.norm(polynomials[:, dofs], axis=1, keepdims=True)
+    amplitude, *_ = np.linalg.lstsq(polynomials[:, dofs].T, field[dofs], rcond=None)
+    parts = np.zeros((len(PARTS), len(field)))
+    for number in range(len(PARTS) - 1):
+        chosen = part == number
+        parts[number] = amplitude[chosen] @ polynomials[chosen]
+    # What the polynomials leave out belongs to the higher derivatives.
+    parts[-1] = field - parts.sum(axis=0)
+    return parts
 
 
 def _superpose_matrix(
