@@ -1,31 +1,32 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which requests the server of the page answers.
+"""The server that browsers reach: it checks each request and passes it on to viser.
 
 A server that listens on this machine only answers a browser of this machine that shows this page.
 Without a check, any page of the internet that is open in a browser here could talk to it: by its
 address, or by a name that leads to this machine (DNS rebinding). A server on other addresses
 answers browsers that were given its token.
 
-viser (1.1) has no setting for these checks and calls no function of its user before the handshake.
-A private method of viser makes the server with `websockets.asyncio.server.serve`. `guarded_server`
-therefore replaces this function, only while the server is being made. Other solutions are worse: a
-proxy leaves viser's own port open to other pages, and a subclass repeats 300 lines of private code.
+viser (1.1) has no setting for these checks. So viser listens at a secret address of this machine
+(`make_secret_address`) and at a port that the system chooses, and `Gate` listens at the address of
+the page. A page of the internet would have to try 2^38 pairs of an address and a port to find
+viser. Other users of this machine could look it up; they are trusted.
 """
 
 from __future__ import annotations
 
+import asyncio
+import errno
 import hmac
-import http
+import http.client
+import io
+import ipaddress
+import secrets
 import socket
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import threading
+from concurrent.futures import Future
+from contextlib import suppress
 from urllib.parse import parse_qs, urlsplit
-
-import websockets.asyncio.server
-from websockets import Headers
-from websockets.asyncio.server import ServerConnection
-from websockets.http11 import Request, Response
 
 from ..core.errors import ConfigError
 
@@ -41,6 +42,29 @@ MISSING_TOKEN = (
     "open the whole address that ./cube view printed, with ?token=… at its end"
 )
 """Text that a browser shows if its request contains neither the token nor the cookie with it."""
+
+MAX_HEAD_S = 10.0
+"""Maximum time, in seconds, from the begin of a connection until its request is complete."""
+
+_CHUNK_BYTES = 1 << 18
+"""Maximum number of bytes that are passed on at a time."""
+
+
+def make_secret_address() -> str:
+    """Return one of 2^23 addresses of this machine (127.x.x.x), chosen at random.
+
+    Raises:
+        ConfigError: The system has no such addresses, as macOS, which has only 127.0.0.1.
+    """
+    address = str(ipaddress.ip_address("127.1.0.1") + secrets.randbelow(1 << 23))
+    try:
+        socket.create_server((address, 0)).close()
+    except OSError as error:
+        raise ConfigError(
+            f"{address}: {error.strerror}; ./cube view needs a system whose loopback addresses are "
+            "all of 127.x.x.x, as Linux"
+        ) from None
+    return address
 
 
 def refusal(
@@ -64,98 +88,140 @@ def refusal(
     return ""
 
 
-def check_host(host: str) -> None:
-    """Check that a server can listen on an address.
+class Gate:
+    """Server, in a thread of its own, that passes the requests of some browsers on to another one.
 
-    If this machine does not have the address, viser (the library of the page) would believe that
-    the port is in use, and wait for ever.
+    It refuses a request for which `refusal` returns a reason, or which lacks a required token. The
+    other server must answer only one request per connection, as that of viser does, because only
+    the first one is checked.
 
-    Args:
-        host: Name or IP address.
-
-    Raises:
-        ConfigError: This machine does not have the address.
+    Attributes:
+        port: TCP port on which the gate listens.
     """
-    try:
-        for family, kind, _, _, address in socket.getaddrinfo(
-            host,
-            0,
-            type=socket.SOCK_STREAM,
-        ):
-            with socket.socket(family, kind) as probe:
-                probe.bind(address)
-    except (OSError, UnicodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ConfigError(
-            f"--host {host}: {reason}; name an address of this machine, or 0.0.0.0 for all of them"
-        ) from None
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        token: str,
+        inner: tuple[str, int],
+    ) -> None:
+        """Begin to listen.
+
+        Args:
+            host: Name or IP address on which the gate listens.
+            port: TCP port; if it is in use, the next free one is taken. 0: any free port.
+            token: Secret text that a browser must send: once in the address (?token=…), and from
+                then on as a cookie. Empty if only this machine can reach the gate.
+            inner: Address and port of the server behind the gate.
+
+        Raises:
+            ConfigError: This machine does not have the address, or the port cannot be opened.
+        """
+        self._token = token
+        self._inner = inner
+        started: Future[int] = Future()
+        self._thread = threading.Thread(
+            target=lambda: asyncio.run(self._run(host, port, started)),
+            daemon=True,
+        )
+        self._thread.start()
+        self.port = started.result()
+
+    def close(self) -> None:
+        """Stop to listen, and end all connections."""
+        self._loop.call_soon_threadsafe(self._ended.set)
+        self._thread.join()
+
+    async def _run(
+        self,
+        host: str,
+        port: int,
+        started: Future[int],
+    ) -> None:
+        """Listen until `close` is called; set the result of `started` to the port."""
+        self._loop = asyncio.get_running_loop()
+        self._ended = asyncio.Event()
+        try:
+            server = await self._listen(host, port)
+        # A host name with an empty or a too long part raises UnicodeError.
+        except (OSError, UnicodeError) as error:
+            reason = getattr(error, "strerror", None) or error
+            mistake = ConfigError(
+                f"--host {host}, --port {port}: {reason}; name an address of this machine, or "
+                "0.0.0.0 for all of them, and a port that you may use"
+            )
+            started.set_exception(mistake)
+            return
+        started.set_result(server.sockets[0].getsockname()[1])
+        await self._ended.wait()
+        server.close()
+
+    async def _listen(self, host: str, port: int) -> asyncio.Server:
+        try:
+            return await asyncio.start_server(self._answer, host, port)
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise
+        return await self._listen(host, port + 1)
+
+    async def _answer(
+        self,
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
+    ) -> None:
+        """Answer one connection of a browser."""
+        failures = (OSError, EOFError, asyncio.LimitOverrunError, asyncio.TimeoutError)
+        with suppress(*failures):
+            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), MAX_HEAD_S)
+            problem, cookie = self._check(head)
+            if problem:
+                text = f"refused: {problem}\n".encode()
+                writer.write(
+                    b"HTTP/1.1 403 Forbidden\r\nConnection: close\r\n"
+                    b"Content-Type: text/plain; charset=utf-8\r\n\r\n" + text
+                )
+            else:
+                inner_reader, inner_writer = await asyncio.open_connection(*self._inner)
+                inner_writer.write(head)
+                # The cookie is the first header after the status line of the answer.
+                writer.write(await inner_reader.readline() + cookie)
+                copies = _copy(reader, inner_writer), _copy(inner_reader, writer)
+                await asyncio.gather(*copies)
+        writer.close()
+
+    def _check(self, head: bytes) -> tuple[str, bytes]:
+        """Check the head of an HTTP request.
+
+        Returns:
+            Why the request is refused, empty if it is accepted; and a line that sets a cookie with
+            the token, empty if the browser needs none.
+        """
+        request, _, fields = head.partition(b"\r\n")
+        headers = http.client.parse_headers(io.BytesIO(fields))
+        host = headers.get("Host", "")
+        problem = refusal(host, headers.get("Origin"), local=not self._token)
+        # A browser sends a cookie to every port of a host. Two servers on one host therefore need
+        # cookies with different names, and the name contains the port.
+        cookie = f"cube_view_{_split(host)[1]}={self._token}"
+        cookies = headers.get("Cookie", "").split("; ")
+        if problem or not self._token or _contains(cookies, cookie):
+            return problem, b""
+
+        query = request.decode("latin-1").partition("?")[2].partition(" ")[0]
+        if not _contains(parse_qs(query).get("token", []), self._token):
+            return MISSING_TOKEN, b""
+        return "", f"Set-Cookie: {cookie}; HttpOnly; SameSite=Lax\r\n".encode()
 
 
-ProcessRequest = Callable[[ServerConnection, Request], Response | None]
-"""Function that answers an HTTP request, or returns None to continue with the websocket."""
-
-
-@contextmanager
-def guarded_server(token: str = "") -> Iterator[None]:
-    """Make a websocket server that is created in this `with` block check each request.
-
-    It refuses a request for which `refusal` returns a reason, or which lacks a required token.
-
-    Args:
-        token: Secret text that a browser must send: once in the address (?token=…), and from then
-            on as a cookie. Empty if the server listens on this machine only and needs none.
-    """
-    serve: Callable[..., object] = websockets.asyncio.server.serve
-
-    def guarded_serve(
-        *arguments: object,
-        process_request: ProcessRequest,
-        **options: object,
-    ) -> object:
-        def check(connection: ServerConnection, request: Request) -> Response | None:
-            return _answer(connection, request, token, process_request)
-
-        return serve(*arguments, process_request=check, **options)
-
-    websockets.asyncio.server.serve = guarded_serve  # type: ignore[assignment, misc]
-    try:
-        yield
-    finally:
-        websockets.asyncio.server.serve = serve  # type: ignore[assignment, misc]
-
-
-def _answer(
-    connection: ServerConnection,
-    request: Request,
-    token: str,
-    process_request: ProcessRequest,
-) -> Response | None:
-    """Refuse a request, or let viser answer it and add a cookie with the token to the answer.
-
-    Args:
-        connection: The connection, as the websockets library passes it.
-        request: The HTTP request with which the connection begins.
-        token: Secret text that browsers must send; empty if none is needed.
-        process_request: Function of viser that answers the request.
-    """
-    host = request.headers.get("Host", "")
-    problem = refusal(host, request.headers.get("Origin"), local=not token)
-    if problem:
-        return _make_refusal(problem)
-    # A browser sends a cookie to every port of a host. Two servers on one host therefore need
-    # cookies with different names, and the name contains the port.
-    cookie = f"cube_view_{_split(host)[1]}={token}"
-    cookies = request.headers.get("Cookie", "").split("; ")
-    if not token or _contains(cookies, cookie):
-        return process_request(connection, request)
-
-    query = request.path.partition("?")[2]
-    if not _contains(parse_qs(query).get("token", []), token):
-        return _make_refusal(MISSING_TOKEN)
-    answer = process_request(connection, request)
-    if answer is not None:
-        answer.headers["Set-Cookie"] = f"{cookie}; HttpOnly; SameSite=Lax"
-    return answer
+async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    """Pass bytes on until the connection ends at one side, then end it at the other side."""
+    with suppress(OSError):
+        while data := await reader.read(_CHUNK_BYTES):
+            writer.write(data)
+            # A browser that does not read stops viser from sending.
+            await writer.drain()
+    writer.close()
 
 
 def _split(host: str) -> tuple[str | None, int | None]:
@@ -182,15 +248,4 @@ def _contains(texts: list[str], wanted: str) -> bool:
     """
     return any(
         hmac.compare_digest(text.encode(errors="replace"), wanted.encode()) for text in texts
-    )
-
-
-def _make_refusal(problem: str) -> Response:
-    headers = Headers({"Content-Type": "text/plain; charset=utf-8"})
-    text = f"refused: {problem}\n".encode()
-    return Response(
-        http.HTTPStatus.FORBIDDEN,
-        "Forbidden",
-        headers,
-        text,
     )

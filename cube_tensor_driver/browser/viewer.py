@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import logging
 import math
 import queue
 import secrets
@@ -29,7 +28,6 @@ from std_srvs.srv import Trigger
 
 from ..core.arrays import Index
 from ..core.defaults import CONTACT_PRESSURE
-from ..core.errors import ConfigError
 from ..core.latest_stress import STALE, STALE_S
 from ..core.rows import StressRows
 from ..messages.contacts import decode_contacts, decode_traction
@@ -44,7 +42,7 @@ from ..srv import Tare
 from . import markup
 from .charts import HISTORY_S
 from .clients import BagRecorder, ReplayClient, ServiceCalls
-from .gate import LOCAL_HOSTS, check_host, guarded_server
+from .gate import LOCAL_HOSTS, Gate, make_secret_address
 from .history import History
 from .markup import PageStatus
 from .page import (
@@ -62,8 +60,9 @@ from .page import (
 from .scan import Links, Scan, ScanSynchronizer
 from .update import ShownSkin
 
-ALL_ADDRESSES = ("0.0.0.0", "::")
-"""Values of --host with which the server listens on all addresses of this machine (IPv4, IPv6)."""
+ALL_ADDRESSES = ("", "0.0.0.0", "::")
+"""Values of --host with which the server listens on all addresses of this machine (both,
+IPv4, IPv6)."""
 
 PICTURE_PERIOD_S = 0.1
 """Period, in seconds, at which picture, numbers and plots of all pages are updated together."""
@@ -113,12 +112,27 @@ class Viewer:
             port: TCP port of the page; if it is in use, the next free one is taken.
             depth: Distance from the centres of the cubes to the surface of the skin, in metres.
             recordings: Folder for the bags that are recorded from the page.
+
+        Raises:
+            ConfigError: This machine does not have the address, or the port cannot be opened.
         """
         self._host = host
         # An address that only this machine can reach needs no token: whoever can open it is a user
         # of this machine.
         self._token = "" if host in LOCAL_HOSTS else secrets.token_urlsafe(16)
-        self._server = _serve(host, port, self._token)
+        address = make_secret_address()
+        # viser prints its address, at which browsers are not to reach it.
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._server = viser.ViserServer(
+                address,
+                0,
+                label="cube_tensor_driver",
+                verbose=False,
+            )
+        inner = address, self._server.get_port()
+        self._gate = Gate(host, port, self._token, inner)
+        # viser warns if a browser disconnects while its picture is made, which is no fault.
+        warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
         self._depth = depth
         self._callback_errors = CallbackErrors(node)
         self._subscriber = SkinSubscriber(
@@ -181,7 +195,7 @@ class Viewer:
         host = socket.gethostname() if self._host in ALL_ADDRESSES else self._host
         name = f"[{host}]" if ":" in host else host
         query = f"/?token={self._token}" if self._token else ""
-        return f"http://{name}:{self._server.get_port()}{query}"
+        return f"http://{name}:{self._gate.port}{query}"
 
     def step(self) -> None:
         """Execute the actions of users, and update the pages if a picture is due."""
@@ -207,6 +221,7 @@ class Viewer:
         # viser prints a message when it stops, which is discarded.
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
+        self._gate.close()
 
     def _show_skin(self, skin: FollowedSkin) -> None:
         """Open new pages in all browsers for a skin that has appeared or has replaced another.
@@ -341,39 +356,6 @@ def make_scan(
         contacts=contacts,
         links=links,
     )
-
-
-def _serve(
-    host: str,
-    port: int,
-    token: str,
-) -> viser.ViserServer:
-    """Start the web server of viser.
-
-    Args:
-        host: Name or IP address on which it listens.
-        port: TCP port; if it is in use, viser takes the next free one.
-        token: Text that browsers must send; empty: none is needed.
-
-    Raises:
-        ConfigError: This machine does not have the address, or the port cannot be opened.
-    """
-    check_host(host)
-    # websockets logs each refused request as an error, but refusing is intended here.
-    logging.getLogger("websockets").setLevel(logging.ERROR)
-    # viser warns if a browser disconnects while its picture is made, which is no fault.
-    warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
-    try:
-        # viser prints the address of the page without the token, which would not work.
-        with contextlib.redirect_stdout(io.StringIO()), guarded_server(token):
-            return viser.ViserServer(
-                host,
-                port,
-                label="cube_tensor_driver",
-                verbose=False,
-            )
-    except OSError as error:
-        raise ConfigError(f"--port {port}: {error.strerror}; take another one") from None
 
 
 def run_view(

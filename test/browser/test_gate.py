@@ -7,6 +7,7 @@ from __future__ import annotations
 import csv
 import http.client
 import io
+import socket
 from collections.abc import Iterator
 from types import SimpleNamespace
 
@@ -22,7 +23,7 @@ from websockets.sync.client import connect
 
 from cube_tensor_driver.browser.charts import format_csv
 from cube_tensor_driver.browser.controls import ColourControls
-from cube_tensor_driver.browser.gate import check_host, guarded_server, refusal
+from cube_tensor_driver.browser.gate import Gate, make_secret_address, refusal
 from cube_tensor_driver.browser.history import History
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.modes import COMPONENTS
@@ -61,11 +62,13 @@ TOKEN = "a-token"
 
 @pytest.fixture(params=["", TOKEN])
 def port(request: pytest.FixtureRequest) -> Iterator[int]:
-    """Of a server with the token, or without one."""
-    with guarded_server(request.param):
-        server = viser.ViserServer(HERE, 0, verbose=False)
-    yield server.get_port()
+    """Of a gate with the token, or without one, before viser."""
+    address = make_secret_address()
+    server = viser.ViserServer(address, 0, verbose=False)
+    gate = Gate(HERE, 0, request.param, (address, server.get_port()))
+    yield gate.port
     server.stop()
+    gate.close()
 
 
 def asked(port: int, path: str = "/", **headers: str) -> http.client.HTTPResponse:
@@ -117,10 +120,29 @@ def test_on_other_addresses_a_browser_needs_the_token(port: int) -> None:
     assert not connected(port, "http://evil.example", Cookie=cookie)
 
 
-@pytest.mark.parametrize("host", ["192.0.2.1", "", "a" * 64 + ".b"])
+@pytest.mark.parametrize("host", ["192.0.2.1", "a" * 64 + ".b"])
 def test_an_address_that_cannot_be_had_is_refused(host: str) -> None:
     with pytest.raises(ConfigError, match="--host"):
-        check_host(host)
+        Gate(host, 0, "", (HERE, 1))
+
+
+def test_the_next_port_is_taken_and_a_silent_browser_does_not_hinder_the_end() -> None:
+    first = Gate(HERE, 0, "", (HERE, 1))
+    second = Gate(HERE, first.port, "", (HERE, 1))
+    assert second.port > first.port
+    with socket.create_connection((HERE, second.port)):
+        second.close()
+    first.close()
+
+
+def test_viser_itself_listens_at_no_address_that_a_page_could_guess() -> None:
+    first, second = make_secret_address(), make_secret_address()
+    assert first != second and HERE not in (first, second)
+    server = viser.ViserServer(first, 0, verbose=False)
+    for address in (HERE, second):
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection((address, server.get_port()))
+    server.stop()
 
 
 def test_values_that_no_control_offers_do_no_harm() -> None:
