@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cube_tensor_driver.simulation.cubes import HubCubes
-from cube_tensor_driver.simulation.load import AnyLoad, LoadMemory
+from cube_tensor_driver.simulation.load import AnyLoad, remember
 
 COUNTER_HZ = 25_000_000
 """Frequency of the counter with which the emulated board (MPS2-AN386) measures pads, in Hz."""
@@ -82,7 +82,7 @@ class Oscillators:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        self._memory = LoadMemory(self.load)
+        self._field_at = remember(self.load)
         self._random = np.random.default_rng(self.seed)
         self._unread = b""
 
@@ -118,7 +118,7 @@ class Oscillators:
         Args:
             middle_us: Device time of the middle of the window, in µs.
         """
-        stress, gradient = self._memory.at(middle_us)
+        stress, gradient = self._field_at(middle_us)
         # Boards have no common clock with the pads, so that the first edge comes at any phase.
         millihertz = self.hub.frequency(stress, gradient, middle_us * 1e-6).ravel()
         return edges(millihertz, self._random.random(len(millihertz)))

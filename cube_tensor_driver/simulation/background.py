@@ -99,7 +99,6 @@ class BackgroundHubs:
         self._stop.request()
         self._thread.join()
         self._simulator.close()
-        self._stop.close()
 
     def __enter__(self) -> BackgroundHubs:
         return self

@@ -23,9 +23,10 @@ from ..core.modes import COMPONENTS, to_gradient_tensor
 from ..core.oscillator import pad_frequency
 from ..core.poses import CubePoses
 from ..device.wire.protocol import NOT_MEASURED
-from .imperfections import Imperfections, PadBehaviour, make_thermal_pads
+from .imperfections import NONE, Imperfections, PadBehaviour
 from .motion import HeavyPads, read_weight
 from .sample_log import ABSENT
+from .temperature import ThermalPads
 
 Millihertz = NDArray[np.uint32]
 """Array of frequencies in mHz, as a hub sends them. The value `NOT_MEASURED` stands for a pad
@@ -39,12 +40,12 @@ class PadErrors(NamedTuple):
         noise: Standard deviation of a frequency divided by the frequency, 0 for no noise. None: the
             noise in the calibration of each cube.
         drift: Relative change of every rest frequency (frequency without load) per second.
-        imperfections: Spread, creep, temperature and failure of the pads; None: none of them.
+        imperfections: Spread, creep, temperature and failure of the pads, and motion of the skin.
     """
 
     noise: float | None = 0.0
     drift: float = 0.0
-    imperfections: Imperfections | None = None
+    imperfections: Imperfections = NONE
 
 
 NO_ERRORS = PadErrors()
@@ -91,14 +92,13 @@ class SimulatedCubes:
             self._noise = np.array([frequency_noise(one) for one in calibrations])
         else:
             self._noise = np.full(shape, noise)
-        self._is_noisy = bool(self._noise.any())
 
-        self._behaviour = None
-        if imperfections is not None:
-            self._behaviour = PadBehaviour(imperfections, shape, seed)
-        self._thermal = make_thermal_pads(imperfections, shape, seed)
+        self._behaviour = PadBehaviour(imperfections, shape, seed)
+        self._thermal: ThermalPads | None = None
+        if imperfections.temperature:
+            self._thermal = ThermalPads(imperfections, shape, seed)
         self.heavy: HeavyPads | None = None
-        if imperfections is not None and imperfections.poses and poses is not None:
+        if imperfections.poses and poses is not None:
             response = read_weight(imperfections.weight, self.n_pads)
             self.heavy = HeavyPads(response, poses, imperfections.poses)
 
@@ -130,26 +130,23 @@ class SimulatedCubes:
         for calibration, rows in self._groups:
             state = compute_true_state(calibration, stress[rows], gradient[rows])
             pad_stress[rows] = state @ calibration.response.T
-        drifted = 1 + self._drift * seconds
-        warm = np.ones_like(pad_stress)
+        rest, beta, modulus = self._law
+        rest = rest * (1 + self._drift * seconds)
         if self._thermal is not None:
             thermal_stress, warm = self._thermal.at(seconds)
             pad_stress += thermal_stress
+            rest *= warm
         if self.heavy is not None:
             pad_stress += self.heavy.stress(seconds)
         # Imperfections change the stress that determines a pad's frequency.
-        if self._behaviour is not None:
-            pad_stress = self._behaviour.reported(pad_stress, seconds)
-
-        rest, beta, modulus = self._law
+        reported = self._behaviour.reported(pad_stress, seconds)
         hertz = pad_frequency(
-            pad_stress,
-            rest * drifted * warm,
+            reported,
+            rest,
             beta,
             modulus,
         )
-        if self._is_noisy:
-            hertz *= 1 + self._noise * self._random.standard_normal(hertz.shape)
+        hertz *= 1 + self._noise * self._random.standard_normal(hertz.shape)
         # The frequency is NaN if the stress is outside the range of the pad law.
         millihertz = np.rint(hertz * 1e3)
         return np.nan_to_num(millihertz, nan=NOT_MEASURED).astype("<u4")

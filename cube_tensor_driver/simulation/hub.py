@@ -174,6 +174,10 @@ class SimulatedHub:
         requests = [frame for frame in frames if isinstance(frame, Request)]
         return b"".join(self._answer(request, now_us) for request in requests)
 
+    def is_due(self, now_us: int) -> bool:
+        """Return whether the hub takes samples and the next one is due at simulated `now_us`."""
+        return self.started and self.next_us <= now_us
+
     def sample(self, frequency: Millihertz) -> bytes:
         """Take the sample that is due at `next_us`, log it and schedule the next one.
 
@@ -183,7 +187,13 @@ class SimulatedHub:
         Returns:
             The SAMPLE frame (message with one sample of all pads).
         """
-        self._log_sample()
+        # A run of the log ends when samples are skipped or get other numbers, the period changes,
+        # or the hub restarts.
+        begin = SampleRun(self.sequence, self.sequence, self.next_us, self.period_us, self.boots)
+        if self.runs and self.runs[-1].is_followed_by(begin):
+            self.runs[-1].last = self.sequence
+        else:
+            self.runs.append(begin)
         sequence = self.sequence & _UINT32_MASK
         device_us = self._compute_positive_device_us(self.next_us)
         self.sequence += 1
@@ -201,21 +211,6 @@ class SimulatedHub:
             temperature,
         )
         return encode(sample, self.version)
-
-    def _log_sample(self) -> None:
-        """Add the sample that is due at `next_us` to the log of all samples."""
-        due = (self.next_us, self.period_us, self.boots)
-        run = self.runs[-1] if self.runs else None
-        # A run ends when samples are skipped or get other numbers, the period changes, or the hub
-        # restarts.
-        if (
-            run is None
-            or self.sequence != run.last + 1
-            or due != (run.end_us, run.period_us, run.boot)
-        ):
-            run = SampleRun(self.sequence, self.sequence, *due)
-            self.runs.append(run)
-        run.last = self.sequence
 
     def skip(self, now_us: int) -> None:
         """Schedule the next sample after simulated time `now_us`; earlier samples are left out.

@@ -35,11 +35,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..config.schema import TEXT, JsonSchema, Schema, integer, list_of, mapping, real
+from ..config.schema import TEXT, JsonSchema, Schema, integer, mapping, real
 from ..config.yaml import read_yaml
 from ..core.arrays import Array
 from ..core.errors import ConfigError
-from .temperature import ThermalPads, read_thermal_stress
 
 MAX_SEED = (1 << 63) - 1
 """Largest seed of the random deviations of the pads: the largest signed 64-bit integer."""
@@ -59,23 +58,31 @@ With their ratio of 1.9, the sum differs from the power law by less than 1e-5 of
 that last 0.01 s to some hours lie far within their range.
 """
 
-_CREEP_TERM: JsonSchema = {
-    "type": "array",
-    "items": [
-        real("a size from 0 up", minimum=0),
-        real("a time above 0 s", exclusiveMinimum=0),
-    ],
-    "minItems": 2,
-    "maxItems": 2,
-    "description": "[size, seconds]",
-}
-"""Schema of an exponential term of creep: size relative to the load, and time constant."""
 
-_KNOTS: JsonSchema = {
-    "type": "array",
-    "items": list_of(real("a number"), "a time in s and a temperature in °C", 2) | {"maxItems": 2},
-    "description": "[[seconds, °C], ...]",
-}
+def _make_table_schema(columns: str, *schemas: JsonSchema) -> JsonSchema:
+    """Return the schema of a list of rows of numbers.
+
+    Args:
+        columns: Names of the columns, as in an error message.
+        schemas: Schema of the number in each column.
+    """
+    row = {
+        "type": "array",
+        "items": list(schemas),
+        "minItems": len(schemas),
+        "maxItems": len(schemas),
+        "description": f"[{columns}]",
+    }
+    return {
+        "type": "array",
+        "items": row,
+        "description": f"[[{columns}], ...]",
+    }
+
+
+_NUMBER = real("a number")
+"""Schema of a number of any size."""
+_KNOTS = _make_table_schema("seconds, °C", _NUMBER, _NUMBER)
 """Schema of a temperature that is linear in time between the given points."""
 
 _SCHEMA = Schema(
@@ -84,11 +91,11 @@ _SCHEMA = Schema(
         {
             "gain_spread": real("a number from 0 to below 1", minimum=0, exclusiveMaximum=1),
             "dead": real("a fraction of the pads from 0 to 1", minimum=0, maximum=1),
-            "creep": {
-                "type": "array",
-                "items": _CREEP_TERM,
-                "description": "[[size, seconds], ...]",
-            },
+            "creep": _make_table_schema(
+                "size, seconds",
+                real("a size from 0 up", minimum=0),
+                real("a time above 0 s", exclusiveMinimum=0),
+            ),
             "creep_growth": real("a growth from 0 to below 1", minimum=0, exclusiveMaximum=1),
             "creep_exponent": real(
                 "an exponent between 0 and 1", exclusiveMinimum=0, exclusiveMaximum=1
@@ -101,11 +108,7 @@ _SCHEMA = Schema(
             "pad_drift": real("a relative change per K"),
             "pad_drift_spread": real("a number from 0 up", minimum=0),
             "layer_spread": real("a number from 0 to 0.3", minimum=0, maximum=0.3),
-            "poses": {
-                "type": "array",
-                "items": list_of(real("a number"), "numbers", 2) | {"minItems": 7, "maxItems": 7},
-                "description": "[[seconds, x, y, z, roll, pitch, yaw], ...]",
-            },
+            "poses": _make_table_schema("seconds, x, y, z, roll, pitch, yaw", *[_NUMBER] * 7),
             "weight": TEXT,
             "seed": integer(0, MAX_SEED, "a whole number from 0 up"),
         },
@@ -192,6 +195,10 @@ class Imperfections:
                 f"creep_growth: found {self.creep_growth:g}, allowed: below {limit:.3g} with this "
                 "creep_exponent and creep_spread"
             )
+
+
+NONE = Imperfections()
+"""Pads that agree with their calibrations."""
 
 
 def read_imperfections(path: Path) -> Imperfections:
@@ -292,36 +299,3 @@ class PadBehaviour:
             reported += (self._creep_size * self._crept).sum(axis=0)
             self._seconds = seconds
         return reported
-
-
-def make_thermal_pads(
-    imperfections: Imperfections | None,
-    shape: tuple[int, int],
-    seed: int,
-) -> ThermalPads | None:
-    """Return the effect of temperature on the pads of some cubes; None if there is none.
-
-    Args:
-        imperfections: Temperatures and the spread of their effects.
-        shape: Number of cubes and of pads per cube.
-        seed: Seed that differs between the hubs of a skin.
-
-    Raises:
-        ConfigError: The file of thermal stress cannot be used for these cubes.
-    """
-    if imperfections is None or not imperfections.temperature:
-        return None
-    n_cubes, n_pads = shape
-    random = np.random.default_rng([imperfections.seed, seed, 1])
-    deviation = random.standard_normal(n_cubes).clip(-3, 3)
-    height = 1 + imperfections.layer_spread * deviation
-    spread = 1 + imperfections.pad_drift_spread * random.standard_normal(shape)
-    _, first_ground = imperfections.temperature[0]
-    return ThermalPads(
-        read_thermal_stress(imperfections.thermal_stress, n_pads),
-        height,
-        imperfections.heat_exchange,
-        imperfections.pad_drift * spread,
-        imperfections.temperature,
-        imperfections.air or ((0.0, first_ground),),
-    )

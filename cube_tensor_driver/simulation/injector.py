@@ -6,8 +6,9 @@ from __future__ import annotations
 
 import heapq
 import itertools
-from collections.abc import Iterable
-from dataclasses import KW_ONLY, dataclass, field, replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -42,20 +43,8 @@ _MAX_INSERTED_BYTES = 20
 _FALSE_UID_BITS = 0xBAD
 """Bits of a hub's uid (unique number) that the fault `uid` inverts."""
 
-_FAULTS_WITHOUT_END = ("stall", "burst", "temperature")
-"""Kinds of faults whose end is not scheduled. The line itself ends a stall and a burst; a changed
-temperature stays until the next fault of the kind `temperature`."""
 
-
-@dataclass
-class _BrokenPad:
-    """A pad under a fault, and its frequency in mHz at the first sample after the fault began."""
-
-    fault: Fault
-    reading: int | None = None
-
-
-@dataclass
+@dataclass(kw_only=True)
 class SimulatedLink:
     """A link of the skin: a simulated hub, its line to the host, and the faults that affect it now.
 
@@ -68,27 +57,27 @@ class SimulatedLink:
         frame_faults: Kinds of faults for the next SAMPLE frames (messages with a sample), one for
             each.
         held_back: Frame that is sent after the next one (fault `reorder`).
-        broken_pads: Pads under a fault.
-        warming: Simulated time in µs at which the temperature began to change, and the fault.
-        hold: Simulated time in µs at which a fault `hold` has frozen the load, and this fault;
-            None: the load changes with time.
+        faults: Faults with a duration that act now, in the order of their begins.
+        first_readings: Frequency in mHz of a pad at the first sample after its fault began.
     """
 
     name: str
     hub: SimulatedHub
     line: SimulatedLine
-    _: KW_ONLY
     damaged: list[tuple[int, int]] = field(default_factory=list)
     frame_faults: list[str] = field(default_factory=list)
     held_back: bytes = b""
-    broken_pads: list[_BrokenPad] = field(default_factory=list)
-    warming: tuple[int, Fault] | None = None
-    hold: tuple[int, Fault] | None = None
+    faults: list[FaultRecord] = field(default_factory=list)
+    first_readings: dict[FaultRecord, int] = field(default_factory=dict)
 
     @property
     def size(self) -> HubSize:
         """Number of cubes and pads of the hub."""
         return HubSize(len(self.hub.cube_uids), self.hub.n_pads)
+
+    def find_faults(self, *kinds: str) -> list[FaultRecord]:
+        """Return the faults of some kinds that act now, in the order of their begins."""
+        return [record for record in self.faults if record.fault.kind in kinds]
 
     def mark_damaged(self) -> None:
         """Record that the frame of the hub's newest sample is altered or not sent."""
@@ -101,7 +90,30 @@ class SimulatedLink:
         It is earlier than the present time `now_us` during the fault `hold`, which keeps the load
         constant.
         """
-        return now_us if self.hold is None else self.hold[0]
+        holds = self.find_faults("hold")
+        return holds[-1].start_us if holds else now_us
+
+    def restart(self, now_us: int, sequence: int = 0) -> None:
+        """Restart the hub, which then describes itself by a HELLO frame.
+
+        Args:
+            now_us: Simulated time in µs.
+            sequence: Number of the next sample of the hub.
+        """
+        self.held_back = b""
+        self.hub.reset(now_us, sequence)
+        self.line.send(self.hub.hello(), now_us)
+
+    def update_hub(self) -> None:
+        """Let the hub state what the present faults make it state."""
+        kinds = {record.fault.kind for record in self.faults}
+        hub = self.hub
+        hub.false_uid = hub.uid ^ _FALSE_UID_BITS if "uid" in kinds else None
+        hub.extra_pads = int("pads" in kinds)
+        hub.version = VERSION + ("version" in kinds)
+        hub.pad_fault = np.zeros(len(hub.cube_uids), "<u4")
+        for record in self.find_faults("report"):
+            hub.pad_fault[record.fault.cube] |= np.uint32(1 << record.fault.pad)
 
 
 class Injector:
@@ -130,9 +142,9 @@ class Injector:
         self.records: list[FaultRecord] = []
         self._links = {link.name: link for link in links}
         self._random = np.random.default_rng(seed)
-        # Heap (priority queue) of begins and ends of faults: simulated time in µs, whether the
-        # fault begins (at the same time, ends come first), serial number, fault.
-        self._schedule: list[tuple[int, bool, int, Fault]] = []
+        # Heap (priority queue) of begins and ends of faults: simulated time in µs, whether it is a
+        # begin (at the same time, ends come first), serial number, action.
+        self._schedule: list[tuple[int, bool, int, Callable[[int], None]]] = []
         self._numbers = itertools.count()
         for fault in faults:
             self.add(fault, round(1e6 * fault.at))
@@ -150,7 +162,15 @@ class Injector:
         sizes = {name: link.size for name, link in self._links.items()}
         # A fault without a link becomes one fault per link.
         for name in check_target(fault, sizes):
-            self._push(at_us, True, replace(fault, link=name))
+            self._push(at_us, True, partial(self._begin, replace(fault, link=name)))
+
+    def _push(
+        self,
+        at_us: int,
+        begins: bool,
+        act: Callable[[int], None],
+    ) -> None:
+        heapq.heappush(self._schedule, (at_us, begins, next(self._numbers), act))
 
     def due_us(self) -> int | None:
         """Return the simulated time in µs at which the next fault begins or ends.
@@ -162,9 +182,8 @@ class Injector:
     def step(self, now_us: int) -> None:
         """Begin and end the faults that are due at simulated time `now_us`."""
         while self._schedule and self._schedule[0][0] <= now_us:
-            _, begins, _, fault = heapq.heappop(self._schedule)
-            act = self._begin if begins else self._end
-            act(fault, now_us)
+            *_, act = heapq.heappop(self._schedule)
+            act(now_us)
 
     def measured(
         self,
@@ -179,26 +198,24 @@ class Injector:
             frequency: Frequencies (cubes, pads) in mHz of pads without faults.
             now_us: Simulated time of the sample in µs.
         """
-        hub = link.hub
         # The array is copied, because it may be used again for a later sample.
         frequency = frequency.copy()
-        if link.warming is not None:
-            begin_us, fault = link.warming
+        # The newest change of the temperature replaces the earlier ones.
+        for record in link.find_faults("temperature")[-1:]:
             # The temperature rises linearly during the fault and then stays constant.
-            elapsed_s = 1e-6 * (now_us - begin_us)
-            share = min(1.0, elapsed_s / max(fault.seconds, 1e-6))
-            rise = share * fault.value
+            elapsed_s = 1e-6 * (now_us - record.start_us)
+            share = min(1.0, elapsed_s / max(record.fault.seconds, 1e-6))
+            rise = share * record.fault.value
             # A rise of 0 ends the fault. The hub then reports no temperature, as before it.
-            hub.celsius = round(100 * (ROOM_CELSIUS + rise)) if rise else TEMPERATURE_UNKNOWN
+            link.hub.celsius = round(100 * (ROOM_CELSIUS + rise)) if rise else TEMPERATURE_UNKNOWN
             warmed = frequency * (1 + RELATIVE_CHANGE_PER_CELSIUS * rise)
             frequency = np.rint(warmed).astype("<u4")
-        for broken in link.broken_pads:
-            pad = broken.fault.cube, broken.fault.pad
-            sound = int(frequency[pad])
-            if broken.reading is None:
-                broken.reading = sound
-            frequency[pad] = compute_broken_reading(broken.fault, sound, broken.reading, now_us)
-        no_cubes, pads_behind = (0, 0), (0, hub.extra_pads)
+        for record in link.find_faults(*PAD_FAULTS):
+            fault = record.fault
+            sound = int(frequency[fault.cube, fault.pad])
+            first = link.first_readings.setdefault(record, sound)
+            frequency[fault.cube, fault.pad] = compute_broken_reading(fault, sound, first, now_us)
+        no_cubes, pads_behind = (0, 0), (0, link.hub.extra_pads)
         return np.pad(frequency, (no_cubes, pads_behind))
 
     def transmitted(self, link: SimulatedLink, data: bytes) -> bytes:
@@ -256,114 +273,50 @@ class Injector:
             now_us: Simulated time in µs.
         """
         link = self._links[fault.link]
-        hub = link.hub
-        line = link.line
         is_momentary = fault.kind in MOMENTARY_FAULTS
         end_us = now_us if is_momentary else now_us + round(1e6 * fault.seconds)
+        record = FaultRecord(now_us, end_us, fault)
+        self.records.append(record)
         match fault.kind:
             case kind if kind in FRAME_FAULTS:
                 link.frame_faults += [kind] * fault.count
-            case kind if kind in PAD_FAULTS:
-                link.broken_pads.append(_BrokenPad(fault))
-                _report_pads(link)
             case "stall":
-                line.held_until_us = end_us
+                link.line.held_until_us = end_us
             case "burst":
-                line.burst_until_us = end_us
+                link.line.burst_until_us = end_us
             case "unplug" | "rename":
                 link.held_back = b""
-                hub.started = False  # a hub is powered by its port
-                line.unplug()
+                link.hub.started = False  # a hub is powered by its port
+                link.line.unplug()
             case "reset":
-                self._restart(link, now_us, 0)
+                link.restart(now_us)
             case "wrap":
                 # Sample numbers reach 2**32 after `count` samples.
-                self._restart(link, now_us, -fault.count % 2**32)
+                link.restart(now_us, -fault.count % 2**32)
             case "drift":
-                hub.set_clock(now_us, drift_ppm=fault.value)
+                link.hub.set_clock(now_us, drift_ppm=fault.value)
             case "step":
-                hub.set_clock(now_us, step_us=round(1e6 * fault.value))
-            case "temperature":
-                link.warming = now_us, fault
-            case "hold":
-                link.hold = now_us, fault
-            case "uid":
-                hub.false_uid = hub.uid ^ _FALSE_UID_BITS
-            case "pads":
-                hub.extra_pads = 1
-            case "version":
-                hub.version = VERSION + 1
+                link.hub.set_clock(now_us, step_us=round(1e6 * fault.value))
+        if not is_momentary:
+            link.faults.append(record)
+            link.update_hub()
+            # A changed temperature stays until the next fault of this kind.
+            if fault.kind != "temperature":
+                self._push(end_us, False, partial(self._end, record))
 
-        self.records.append(FaultRecord(now_us, end_us, fault))
-        if end_us > now_us and fault.kind not in _FAULTS_WITHOUT_END:
-            self._push(end_us, False, fault)
-
-    def _restart(
-        self,
-        link: SimulatedLink,
-        now_us: int,
-        sequence: int,
-    ) -> None:
-        """Restart a hub, which then describes itself by a HELLO frame.
-
-        Args:
-            link: Link of the hub.
-            now_us: Simulated time in µs.
-            sequence: Number of the next sample of the hub.
-        """
-        link.held_back = b""
-        link.hub.reset(now_us, sequence)
-        link.line.send(link.hub.hello(), now_us)
-
-    def _end(self, fault: Fault, now_us: int) -> None:
-        """End a fault on its link, and undo its effect on the hub, its pads or its line.
-
-        Args:
-            fault: Fault that has lasted for its duration.
-            now_us: Simulated time in µs.
-        """
+    def _end(self, record: FaultRecord, now_us: int) -> None:
+        """End a fault on its link at simulated time `now_us`."""
+        fault = record.fault
         link = self._links[fault.link]
-        hub = link.hub
-        line = link.line
-        match fault.kind:
-            case kind if kind in PAD_FAULTS:
-                link.broken_pads = [
-                    broken for broken in link.broken_pads if broken.fault is not fault
-                ]
-                _report_pads(link)
-            case "hold":
-                # A fault `hold` that began later has replaced this one, and does not end now.
-                if link.hold is not None and link.hold[1] is fault:
-                    link.hold = None
-            case "unplug" | "rename":
-                if line.plugged:
-                    return  # the end of another fault has plugged the line in already
-                renamed = None
-                if fault.kind == "rename":
-                    renamed = line.port.with_name(f"{link.name}_{len(self.records)}")
-                line.plug(renamed)
-                self._restart(link, now_us, 0)
-            case "uid":
-                hub.false_uid = None
-            case "pads":
-                hub.extra_pads = 0
-            case "version":
-                hub.version = VERSION
-
-    def _push(
-        self,
-        at_us: int,
-        begins: bool,
-        fault: Fault,
-    ) -> None:
-        """Schedule the begin or the end of a fault.
-
-        Args:
-            at_us: Simulated time in µs.
-            begins: Whether the fault begins at this time; otherwise it ends.
-            fault: Fault with the name of a single link.
-        """
-        heapq.heappush(self._schedule, (at_us, begins, next(self._numbers), fault))
+        link.faults.remove(record)
+        link.update_hub()
+        # The end of another fault may have plugged the line in already.
+        if fault.kind in ("unplug", "rename") and not link.line.plugged:
+            renamed = None
+            if fault.kind == "rename":
+                renamed = link.line.port.with_name(f"{link.name}_{len(self.records)}")
+            link.line.plug(renamed)
+            link.restart(now_us)
 
 
 def compute_broken_reading(
@@ -392,12 +345,3 @@ def compute_broken_reading(
         case "stuck":
             return first
     return sound
-
-
-def _report_pads(link: SimulatedLink) -> None:
-    """Set the pads that a hub reports as failed in its frames: those under the fault `report`."""
-    bits = np.zeros(len(link.hub.cube_uids), "<u4")
-    for broken in link.broken_pads:
-        if broken.fault.kind == "report":
-            bits[broken.fault.cube] |= np.uint32(1 << broken.fault.pad)
-    link.hub.pad_fault = bits

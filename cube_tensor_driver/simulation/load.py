@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Protocol
@@ -33,7 +33,7 @@ MAX_RADIUS_DEPTHS = 12
 need more point forces, and computing their stress would take minutes."""
 
 MAX_CACHED_BYTES = 64 << 20
-"""Maximum memory, in bytes, of the stress fields that `LoadMemory` keeps for a repeated load."""
+"""Maximum memory, in bytes, of the stress fields that `remember` keeps for a repeated load."""
 
 _ORDERS = np.array([2, 3, 4, 6, 8, 11, 16, 23, 32, 45, 64])
 """Numbers of concentric rings of point forces by which a contact can be represented (quadrature
@@ -290,14 +290,14 @@ class Load:
         duration = action.end - action.start
         progress = (seconds - action.start) / duration  # 0 to 1
         path = self._paths[id(action)]
-        position = self._to_metres(action.path[0])
+        position, velocity = self._to_metres(action.path[0]), np.zeros(3)
         if path:
-            position = path.position(progress)
+            position, velocity = path.at(progress)
         normal = surface_normal(self.poses, self._pitch, position)
         size = float(interpolate_knots(action.force, progress))
         if path and action.kind == "slide":
             # Friction acts along the part of the velocity that is tangential to the skin.
-            velocity = path.velocity(progress) / duration
+            velocity = velocity / duration
             velocity -= normal * (velocity @ normal)
             speed = float(np.linalg.norm(velocity))
             shear = indenter.friction * size * velocity
@@ -407,32 +407,20 @@ def total(loads: Sequence[ContactLoad | Contact]) -> Resultant:
     return forces.sum(axis=0), centre, normal
 
 
-class LoadMemory:
-    """Computes the stress fields of a load at whole microseconds.
+def remember(load: Fields) -> Callable[[int], StressField]:
+    """Return a function of a time in whole µs that gives the stress fields of a load.
 
-    Fields of a load that repeats are kept for its next period, because computing them takes long.
+    It keeps the fields of a load that repeats for the next period, because computing them takes
+    long.
     """
+    period_us = math.inf if load.repeats is None else round(1e6 * load.repeats)
+    field_bytes = sum(part.nbytes for part in load.at(0.0))
 
-    def __init__(self, load: Fields) -> None:
-        self._load = load
-        period = load.repeats
-        self._period_us = None if period is None else round(1e6 * period)
-        self._fields: dict[int, StressField] = {}
+    @lru_cache(MAX_CACHED_BYTES // field_bytes)
+    def at(time_us: float) -> StressField:
+        return load.at(time_us * 1e-6)
 
-    def at(self, time_us: int) -> StressField:
-        """Return stress (cubes, 6) in Pa and gradient (cubes, 6, 3) in Pa/m at a time in µs."""
-        if self._period_us is not None:
-            time_us %= self._period_us
-        field = self._fields.get(time_us)
-        if field is None:
-            field = self._load.at(time_us * 1e-6)
-            # If the memory is full, all fields are removed. The load comes back to a stored time
-            # only after one period, and by then the memory would be full again.
-            field_bytes = sum(part.nbytes for part in field)
-            if (len(self._fields) + 1) * field_bytes > MAX_CACHED_BYTES:
-                self._fields.clear()
-            self._fields[time_us] = field
-        return field
+    return lambda time_us: at(time_us % period_us)
 
 
 def _choose_orders(

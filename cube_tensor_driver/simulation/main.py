@@ -18,7 +18,7 @@ from ..config.yaml import read_yaml
 from ..core.errors import CubeError
 from .cubes import PadErrors
 from .faults import parse_faults
-from .imperfections import read_imperfections
+from .imperfections import NONE, read_imperfections
 from .load import read_load
 from .simulator import Simulator, StopRequest
 
@@ -125,7 +125,7 @@ def _create_simulator(
         faults = parse_faults(read_yaml(options.faults), str(options.faults))
     skin = read_skin(options.config)
     load = read_load(skin, options.load, options.mujoco)
-    imperfections = None
+    imperfections = NONE
     if options.imperfections:
         imperfections = read_imperfections(options.imperfections)
     return simulator(

@@ -82,9 +82,8 @@ class MovingFrame:
 
     def angular_velocity(self, seconds: float) -> Array:
         """Return the angular velocity (3,) at a time in s, along the parent frame, in rad/s."""
-        _, before = self._compute_pose(seconds - STEP_S)
-        _, now = self._compute_pose(seconds)
-        _, after = self._compute_pose(seconds + STEP_S)
+        times = seconds - STEP_S, seconds, seconds + STEP_S
+        (_, before), (_, now), (_, after) = map(self._compute_pose, times)
         turning = now.T @ (after - before) / (2 * STEP_S)
         return np.array([turning[2, 1], turning[0, 2], turning[1, 0]])
 
@@ -102,17 +101,14 @@ class MovingFrame:
             axes: Rotations (N, 3, 3) from the frames of the results to the parent frame.
         """
         times = seconds - STEP_S, seconds, seconds + STEP_S
-        poses = [self._compute_pose(time) for time in times]
-        positions = []
-        for origin, rotation in poses:
-            positions.append(origin + points @ rotation.T)
-        before, now, after = positions
-        in_world = (after - 2 * now + before) / STEP_S**2
+        (origin_before, before), (origin, now), (origin_after, after) = map(
+            self._compute_pose, times
+        )
+        moved = origin_after - 2 * origin + origin_before
+        turned = after - 2 * now + before
+        in_world = (moved + points @ turned.T) / STEP_S**2
         in_world[:, 2] += STANDARD_GRAVITY
-        _, rotation = poses[1]
-        to_world = rotation @ axes
-        force: Array = (in_world[:, None] @ to_world)[:, 0]
-        return force
+        return np.asarray(np.einsum("nji,nj->ni", now @ axes, in_world))
 
 
 class HeavyPads:
@@ -141,5 +137,4 @@ class HeavyPads:
 
     def stress(self, seconds: float) -> Array:
         """Return the stress of the pads by weight and inertia (cubes, P), in Pa."""
-        stress: Array = self.specific_force(seconds) @ self._response.T
-        return stress
+        return np.asarray(self.specific_force(seconds) @ self._response.T)

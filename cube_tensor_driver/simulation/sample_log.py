@@ -53,10 +53,11 @@ class SampleRun:
     def __len__(self) -> int:
         return self.last - self.first + 1
 
-    @property
-    def end_us(self) -> int:
-        """Simulated time in µs at which the sample after the last one would be due."""
-        return self.start_us + len(self) * self.period_us
+    def is_followed_by(self, run: SampleRun) -> bool:
+        """Return whether the first sample of another run is the one that follows this run."""
+        end_us = self.start_us + len(self) * self.period_us
+        follows = (self.last + 1, end_us, self.period_us, self.boot)
+        return follows == (run.first, run.start_us, run.period_us, run.boot)
 
 
 @dataclass(frozen=True)
@@ -142,21 +143,18 @@ class SampleLog:
     @classmethod
     def _parse(cls, data: dict[str, Any]) -> SampleLog:
         """Create a log from the dictionary that its JSON file contains."""
-        links = tuple(
-            LinkLog(
-                name=link["name"],
-                cubes=tuple(link["cubes"]),
-                dropped=link["dropped"],
-                runs=tuple(SampleRun(**run) for run in link["runs"]),
-                damaged=tuple(map(tuple, link["damaged"])),
-            )
-            for link in data["links"]
+        links = []
+        for link in data["links"]:
+            tuples = {
+                "cubes": tuple(link["cubes"]),
+                "runs": tuple(SampleRun(**run) for run in link["runs"]),
+                "damaged": tuple(map(tuple, link["damaged"])),
+            }
+            links.append(LinkLog(**link | tuples))
+        faults = tuple(
+            FaultRecord(**record | {"fault": Fault(**record["fault"])}) for record in data["faults"]
         )
-        faults = []
-        for record in data["faults"]:
-            fault = Fault(**record["fault"])
-            faults.append(FaultRecord(**record | {"fault": fault}))
-        return cls(data["start_time_ns"], links, tuple(faults))
+        return cls(data["start_time_ns"], tuple(links), faults)
 
     @property
     def dropped(self) -> int:
@@ -173,17 +171,14 @@ class SampleLog:
             link_of_cube[link.members] = index
             for run in link.runs:
                 count = np.arange(len(run))
-                link_index = np.full(len(run), index)
-                number = run.first + count
                 time_us = run.start_us + run.period_us * count
-                parts.append(np.array([link_index, number, time_us]))
+                parts.append(np.array([0 * count + index, run.first + count, time_us]))
         links, numbers, times_us = np.hstack(parts)
-        rows_per_sample = [len(link.members) for link in self.links]
         return SampleTable(
             link=links,
             number=numbers,
             time_ns=self.start_time_ns + 1000 * times_us,
-            rows_per_sample=np.array(rows_per_sample, int),
+            rows_per_sample=np.array([len(link.members) for link in self.links], int),
             link_of_cube=link_of_cube,
         )
 

@@ -14,9 +14,8 @@ import select
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from pathlib import Path
 
 from ..config.skin import Skin, SkinLink
@@ -27,7 +26,7 @@ from .faults import Fault
 from .hub import SimulatedHub
 from .injector import Injector, SimulatedLink
 from .line import SimulatedLine
-from .load import Fields, LoadMemory
+from .load import Fields, remember
 from .sample_log import ABSENT, LinkLog, SampleLog
 
 FIRST_UID = 0xC0BE_0000_0000_0001
@@ -51,6 +50,9 @@ MAX_WAIT_S = 1.0
 """Maximum time, in seconds, from SIGINT until the simulator ends. It ends earlier if all drivers
 have asked the hubs to send no more samples (STOP)."""
 
+MAX_STEP_S = 0.05
+"""Maximum time, in seconds, from the request to end the simulator until it notices it."""
+
 REPORT_PERIOD_US = 1_000_000
 """Period, in µs, at which a hub sends the HELLO frame (its description) and the STATS frame (its
 counters)."""
@@ -71,7 +73,7 @@ _PIPE_BYTES = 65536
 """Maximum number of bytes that one read from the pipe for faults returns."""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class PlayedLink(SimulatedLink):
     """A simulated link and the cubes on its hub.
 
@@ -127,7 +129,7 @@ class Simulator:
                 or a fault names a link, cube or pad that does not exist.
         """
         self._ports = ports
-        self._load = LoadMemory(load)
+        self._field_at = remember(load)
         # Both clocks are read together, because simulated times (by the monotonic clock) are
         # converted to wall clock times in the log.
         self._start_ns = time.monotonic_ns()
@@ -136,8 +138,13 @@ class Simulator:
         try:
             ports.mkdir(parents=True, exist_ok=True)
             for carried in make_hub_cubes(skin, errors):
-                line = self._make_line(carried.link)
-                self._links.append(_connect(skin, carried, line))
+                link = PlayedLink(
+                    name=carried.link.name,
+                    hub=_make_hub(skin, carried),
+                    line=self._make_line(carried.link),
+                    carried=carried,
+                )
+                self._links.append(link)
             sizes = {link.name: asdict(link.size) for link in self._links}
             write_yaml(ports / HUBS_FILE, sizes)
             (ports / START_FILE).write_text(str(self.start_time_ns))
@@ -149,7 +156,11 @@ class Simulator:
             ) from None
 
         self._injector = Injector(self._links, faults)
-        self._prepare(load, instants)
+        for number in range(instants):
+            stress, gradient = load.at(number * load.period / instants)
+            for link in self._links:
+                frequency = link.carried.frequency(stress, gradient, 0.0)
+                link.prepared.append(frequency)
         for link in self._links:
             link.line.send(link.hub.hello(), 0)
 
@@ -159,19 +170,6 @@ class Simulator:
         Subclasses may create another kind of line.
         """
         return SimulatedLine(self._ports / link.name)
-
-    def _prepare(self, load: Fields, instants: int) -> None:
-        """Compute the frequencies of all hubs in advance.
-
-        Args:
-            load: Stress and gradient at the cubes over time.
-            instants: Number of times, equally spaced over the period of the load.
-        """
-        for number in range(instants):
-            stress, gradient = load.at(number * load.period / instants)
-            for link in self._links:
-                frequency = link.carried.frequency(stress, gradient, 0.0)
-                link.prepared.append(frequency)
 
     def now_us(self) -> int:
         """Return the simulated time in µs since the creation of the simulator."""
@@ -184,44 +182,36 @@ class Simulator:
         """
         report_us = REPORT_PERIOD_US
         while not stop.is_due(self._is_needed()):
-            readers: dict[int, Callable[[], object]] = {
-                stop.fd: partial(os.read, stop.fd, 64),
-                self._fault_pipe: self._read_faults,
-            }
             # A line that was unplugged and plugged in again has another file descriptor.
-            for link in self._links:
-                if link.line.plugged:
-                    readers[link.line.fd] = partial(self._answer, link)
+            plugged = {link.line.fd: link for link in self._links if link.line.plugged}
             now = self.now_us()
             # A pseudo-terminal takes some 10 kB at a time; large frames wait until the host reads.
-            writers = [link.line.fd for link in self._links if link.line.is_waiting(now)]
+            writers = [fd for fd, link in plugged.items() if link.line.is_waiting(now)]
             wait_us = self._find_due_us(report_us) - now
-            wait_s = max(0.0, wait_us * 1e-6)
+            wait_s = min(max(wait_us * 1e-6, 0.0), MAX_STEP_S)
             # `select` is used, because epoll rounds waiting times to milliseconds.
-            readable, _, _ = select.select(readers, writers, [], wait_s)
+            readable, _, _ = select.select([*plugged, self._fault_pipe], writers, [], wait_s)
             for fd in readable:
-                readers[fd]()
+                if fd == self._fault_pipe:
+                    self._read_faults()
+                else:
+                    self._answer(plugged[fd])
 
             now = self.now_us()
-            self._skip_late(now)
             self._take_samples(now, stop)
             for link in self._links:
                 link.line.flush(now)
                 if link.computes_load:
                     # The load of the next sample is computed in advance, so that the sample is not
                     # late.
-                    self._load.at(link.hub.next_us)
+                    self._field_at(link.hub.next_us)
             self._injector.step(now)
             if now >= report_us:
                 report_us += REPORT_PERIOD_US
-                self._report(now)
-
-    def _report(self, now_us: int) -> None:
-        """Send the HELLO and STATS frames of all hubs whose line is plugged in."""
-        for link in self._links:
-            if link.line.plugged:
-                frames = link.hub.hello() + link.hub.stats(now_us)
-                link.line.send(frames, now_us)
+                for link in self._links:
+                    if link.line.plugged:
+                        frames = link.hub.hello() + link.hub.stats(now)
+                        link.line.send(frames, now)
 
     def _is_needed(self) -> bool:
         """Return whether a driver has asked one of the hubs for samples and not stopped it."""
@@ -273,32 +263,26 @@ class Simulator:
             times += [sample_us, link.line.due_us(now)]
         return min(time for time in times if time is not None)
 
-    def _skip_late(self, now_us: int) -> None:
-        """Leave out the samples of hubs that are late by more than `MAX_DELAY_US`.
+    def _take_samples(self, now_us: int, stop: StopRequest) -> None:
+        """Take all samples that are due at simulated time `now_us`, unless a stop is requested.
 
+        Every hub takes one sample before any hub takes its next one. So if the simulator is late,
+        all hubs are equally late. Hubs that are late by more than `MAX_DELAY_US` leave samples out.
         Samples whose load was computed in advance are never left out, because they take so little
         time that a late hub catches up.
         """
         for link in self._links:
             if link.computes_load and now_us - link.hub.next_us > MAX_DELAY_US:
                 link.hub.skip(now_us)
-
-    def _take_samples(self, now_us: int, stop: StopRequest) -> None:
-        """Take all samples that are due at simulated time `now_us`, unless a stop is requested.
-
-        Every hub takes one sample before any hub takes its next one. So if the simulator is late,
-        all hubs are equally late.
-        """
-        is_behind = True
-        while is_behind and not stop.is_due(self._is_needed()):
-            is_behind = False
-            for link in self._links:
-                if link.hub.started and link.hub.next_us <= now_us:
-                    # Faults that are due before this sample come first, also if this loop is late.
-                    self._injector.step(link.hub.next_us)
-                    if link.hub.started:
-                        self._take_sample(link, now_us)
-                    is_behind |= link.hub.started and link.hub.next_us <= now_us
+        while not stop.is_due(self._is_needed()):
+            due = [link for link in self._links if link.hub.is_due(now_us)]
+            if not due:
+                return
+            for link in due:
+                # Faults that are due before this sample come first, also if this loop is late.
+                self._injector.step(link.hub.next_us)
+                if link.hub.started:
+                    self._take_sample(link, now_us)
 
     def _take_sample(self, link: PlayedLink, now_us: int) -> None:
         """Take the next sample of a hub, and send its frame unless a fault loses it.
@@ -313,7 +297,7 @@ class Simulator:
             instant = load_us // link.hub.period_us % len(link.prepared)
             frequency = link.prepared[instant]
         else:
-            stress, gradient = self._load.at(load_us)
+            stress, gradient = self._field_at(load_us)
             frequency = link.carried.frequency(stress, gradient, time_us * 1e-6)
         celsius = link.carried.cubes.temperature(time_us * 1e-6)
         if not math.isnan(celsius):
@@ -347,17 +331,11 @@ class Simulator:
 
 
 class StopRequest:
-    """Request to end the simulator, which another thread or a signal makes.
-
-    Attributes:
-        fd: File descriptor that becomes readable when the stop is requested, which ends the waiting
-            of a selector.
-    """
+    """Request to end the simulator, which another thread or a signal makes."""
 
     def __init__(self) -> None:
         # Latest monotonic time, in s, at which the simulator ends; infinite before a request.
         self._until_s = math.inf
-        self.fd, self._write = os.pipe()
 
     def request(
         self,
@@ -375,7 +353,6 @@ class StopRequest:
         """
         wait_s = MAX_WAIT_S if number == signal.SIGINT else 0.0
         self._until_s = min(self._until_s, time.monotonic() + wait_s)
-        os.write(self._write, b"\0")
 
     def is_due(self, is_needed: bool) -> bool:
         """Return whether to end now.
@@ -387,40 +364,26 @@ class StopRequest:
             return False
         return not is_needed or time.monotonic() >= self._until_s
 
-    def close(self) -> None:
-        """Close both ends of the pipe to which `fd` belongs."""
-        os.close(self.fd)
-        os.close(self._write)
 
-
-def _connect(
-    skin: Skin,
-    carried: HubCubes,
-    line: SimulatedLine,
-) -> PlayedLink:
-    """Create a simulated link with its hub.
+def _make_hub(skin: Skin, carried: HubCubes) -> SimulatedHub:
+    """Create the hub of a link.
 
     Args:
         skin: Skin that contains the link.
         carried: Link and cubes of the hub.
-        line: Line of the hub to the host.
     """
-    link = carried.link
-    number = skin.links.index(link) + 1
-    uids = []
-    for place, cube in enumerate(carried.members.tolist()):
-        if cube == ABSENT:
-            uids.append(ABSENT_UID - place)
-        else:
-            uids.append(skin.cubes[cube].uid or FIRST_UID + cube)
-
-    hub = SimulatedHub(
-        uid=link.hub_uid or number,
+    number = skin.links.index(carried.link) + 1
+    given = [cube.uid or FIRST_UID + index for index, cube in enumerate(skin.cubes)]
+    uids = [
+        ABSENT_UID - place if cube == ABSENT else given[cube]
+        for place, cube in enumerate(carried.members.tolist())
+    ]
+    return SimulatedHub(
+        uid=carried.link.hub_uid or number,
         cube_uids=uids,
         n_pads=carried.cubes.n_pads,
         boot_us=FIRST_BOOT_US * number,
     )
-    return PlayedLink(link.name, hub, line, carried)
 
 
 def _open_pipe(path: Path) -> int:

@@ -19,8 +19,8 @@ from ..core.rows import COUNTER_RANGE, FrequencyRows
 from ..device.wire.protocol import to_hertz
 from .cubes import NO_ERRORS, PadErrors, make_hub_cubes
 from .hub import PERIOD_LIMITS_US, SimulatedHub
-from .imperfections import Imperfections
-from .load import AnyLoad, LoadMemory, read_load
+from .imperfections import NONE, Imperfections
+from .load import AnyLoad, read_load, remember
 
 
 def simulate(
@@ -43,8 +43,7 @@ def simulate(
         duration: Simulated time in s; None: without end.
         noise: Standard deviation of a frequency divided by the frequency (8e-6 is usual).
         drift: Relative change of every rest frequency (frequency without load) per second.
-        imperfections: Spread, creep and failure of the pads; None: pads without deviations from
-            their calibrations.
+        imperfections: Spread, creep and failure of the pads; None: none of them.
 
     Returns:
         Source of frequency rows.
@@ -89,7 +88,7 @@ def simulate(
     # The cubes are created again in each iteration. Creating them here, too, raises errors of the
     # skin before the first iteration.
     make_hub_cubes(skin)
-    errors = PadErrors(noise, drift, imperfections)
+    errors = PadErrors(noise, drift, imperfections or NONE)
     return SimulatedSource(
         skin,
         load,
@@ -147,12 +146,12 @@ class SimulatedSource:
 
     def __iter__(self) -> Iterator[FrequencyRows]:
         pads = SkinPads(self.skin, self.errors)
-        fields = LoadMemory(self.load)
+        field_at = remember(self.load)
         end_us = math.inf if self.duration is None else round(1e6 * self.duration)
         self.scans = 0
         while (time_us := self.scans * self.period_us) < end_us:
             self.scans += 1
-            stress, gradient = fields.at(time_us)
+            stress, gradient = field_at(time_us)
             yield pads.rows(stress, gradient, self.scans - 1, time_us)
 
     def __enter__(self) -> SimulatedSource:

@@ -30,6 +30,7 @@ from ..config.package_data import find_shipped
 from ..config.yaml import read_yaml
 from ..core.arrays import Array
 from ..core.errors import ConfigError
+from .imperfections import Imperfections
 
 REFERENCE_CELSIUS = 25.0
 """Temperature, in °C, at which the rest frequencies of the calibrations hold and no pad has thermal
@@ -121,19 +122,16 @@ class WarmLayer:
             air: Temperature of the air, in °C.
         """
         size = height[:, None] / CELLS
-        matrix = np.zeros((len(height), CELLS, CELLS))
-        inner = np.arange(CELLS - 1)
-        # Each finite volume exchanges heat with the next one. The first one exchanges twice as much
-        # with the ground, which is at half the distance.
-        outer = inner + 1
-        for a, b in ((inner, outer), (outer, inner)):
-            matrix[:, a, b] += 1
-            matrix[:, a, a] -= 1
-        matrix[:, 0, 0] -= 2
         air_resistance = CONDUCTIVITY / (exchange * size[:, 0])
         to_air = 1 / (air_resistance + 0.5)
-        matrix[:, -1, -1] -= to_air
-        rate, self._vectors = np.linalg.eigh(matrix)
+        # Each finite volume exchanges heat with the next one. The first one exchanges twice as much
+        # with the ground, which is at half the distance.
+        next_one = np.eye(CELLS, k=1)
+        coupling = next_one + next_one.T
+        loss = np.tile(coupling.sum(axis=0), (len(height), 1))
+        loss[:, 0] += 2
+        loss[:, -1] += to_air
+        rate, self._vectors = np.linalg.eigh(coupling - loss[:, None] * np.eye(CELLS))
         self._rate = -rate * DIFFUSIVITY / size**2
         # Amplitude of each eigenvector in the steady state, per °C of the ground and of the air.
         at_ground = self._vectors[:, 0]
@@ -145,15 +143,12 @@ class WarmLayer:
 
     def _find_steady(self, ground: float, air: float) -> Array:
         """Return the amplitudes of the steady state under temperatures of ground and air, in °C."""
-        steady: Array = ground * self._from_ground + air * self._from_air
-        return steady
+        return np.asarray(ground * self._from_ground + air * self._from_air)
 
     @property
     def temperature(self) -> Array:
         """Temperature of each finite volume (cubes, `CELLS`), in °C, from the ground up."""
-        columns = self._vectors @ self._amplitude[:, :, None]
-        temperature: Array = columns[:, :, 0]
-        return temperature
+        return np.asarray(np.einsum("cij,cj->ci", self._vectors, self._amplitude))
 
     def advance(
         self,
@@ -186,28 +181,36 @@ class ThermalPads:
 
     def __init__(
         self,
-        layer: ThermalLayer,
-        height: Array,
-        exchange: float,
-        drift: Array,
-        ground: tuple[tuple[float, float], ...],
-        air: tuple[tuple[float, float], ...],
+        imperfections: Imperfections,
+        shape: tuple[int, int],
+        seed: int,
     ) -> None:
         """Prepare the layer.
 
         Args:
-            layer: Layer with the cubes, and the thermal stress of their pads.
-            height: Height of the layer at each cube (cubes,), divided by `layer.height`.
-            exchange: Heat exchange of the surface with the air, in W/(m² K).
-            drift: Relative change of the rest frequency of each pad (cubes, P), per K.
-            ground, air: Pairs of a time in s and a temperature in °C, which changes linearly
-                between these times.
+            imperfections: Temperatures of ground and air, and the spread of their effects.
+            shape: Number of cubes and of pads per cube.
+            seed: Seed that differs between the hubs of a skin.
+
+        Raises:
+            ConfigError: The file of thermal stress cannot be used for these cubes.
         """
-        self._knots = [np.array(knots).T for knots in (ground, air)]
-        self._drift = drift
+        n_cubes, n_pads = shape
+        layer = read_thermal_stress(imperfections.thermal_stress, n_pads)
+        random = np.random.default_rng([imperfections.seed, seed, 1])
+        deviation = random.standard_normal(n_cubes).clip(-3, 3)
+        height = layer.height * (1 + imperfections.layer_spread * deviation)
+        spread = 1 + imperfections.pad_drift_spread * random.standard_normal(shape)
+        # Relative change of the rest frequency of each pad per K.
+        self._drift = imperfections.pad_drift * spread
+
+        ground = np.array(imperfections.temperature).T
+        air = np.array(imperfections.air).T if imperfections.air else ground[:, :1]
+        # Rows of both: times in s, temperatures in °C.
+        self._knots = [ground, air]
         self._seconds = 0.0
         outside = self._outside(0.0)
-        self._layer = WarmLayer(height * layer.height, exchange, *outside)
+        self._layer = WarmLayer(height, imperfections.heat_exchange, *outside)
 
         s = (2 * np.arange(CELLS) + 1) / CELLS - 1
         # The temperatures are fitted by least squares, because Legendre polynomials are not
@@ -223,10 +226,8 @@ class ThermalPads:
 
     def _outside(self, seconds: float) -> tuple[float, float]:
         """Return the temperatures of ground and air at a time in s, in °C."""
-        ground, air = self._knots
-        ground_temperature = np.interp(seconds, *ground)
-        air_temperature = np.interp(seconds, *air)
-        return float(ground_temperature), float(air_temperature)
+        ground, air = (float(np.interp(seconds, *knots)) for knots in self._knots)
+        return ground, air
 
     def measured(self, seconds: float) -> float:
         """Return what the hub's thermometer measures, the temperature of the ground, in °C."""
@@ -242,11 +243,9 @@ class ThermalPads:
             Thermal stress of the pads (cubes, P), in Pa, and the factors (cubes, P) by which
             temperature multiplies their rest frequencies.
         """
-        knots = [times for times, _ in self._knots]
-        all_times = np.concatenate([*knots, [seconds]])
-        times = np.unique(all_times)
-        is_passed = (times > self._seconds) & (times <= seconds)
-        for time in times[is_passed].tolist():
+        knots = np.concatenate([times for times, _ in self._knots])
+        passed = knots[(knots > self._seconds) & (knots < seconds)]
+        for time in [*sorted(passed.tolist()), seconds]:
             outside = self._outside(time)
             self._layer.advance(time - self._seconds, *outside)
             self._seconds = time

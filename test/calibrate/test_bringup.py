@@ -165,7 +165,6 @@ def played(folder: Path, calibrations: list[Calibration], person: Person) -> Ite
         stop.request()
         thread.join()
         simulator.close()
-        stop.close()
 
 
 def row(calibrations: list[Calibration]) -> Skin:

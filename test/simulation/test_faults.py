@@ -54,7 +54,7 @@ class FaultyLink(SimulatedLink):
 
     def __init__(self, *faults):
         hub = SimulatedHub(uid=1, cube_uids=[10, 11], n_pads=8, period_us=PERIOD_US, started=True)
-        super().__init__("hub0", hub, KeptLine())
+        super().__init__(name="hub0", hub=hub, line=KeptLine())
         self.injector = Injector([self], [Fault(**fault) for fault in faults], seed=3)
 
     def play(self, samples):

@@ -167,8 +167,9 @@ def test_the_curve_of_a_path_is_the_cubic_spline_of_scipy(points, closed):
     ends = "periodic" if closed else "clamped"
     expected = interpolate.CubicSpline(np.linspace(0, 1, len(path)), path, bc_type=ends)
     for time in np.linspace(0, 1, 41):
-        np.testing.assert_allclose(curve.position(time), expected(time), atol=1e-12)
-        np.testing.assert_allclose(curve.velocity(time), expected(time, 1), atol=1e-10)
+        position, velocity = curve.at(time)
+        np.testing.assert_allclose(position, expected(time), atol=1e-12)
+        np.testing.assert_allclose(velocity, expected(time, 1), atol=1e-10)
 
 
 def test_taps_presses_and_the_time_between(tmp_path):

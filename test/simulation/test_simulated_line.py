@@ -52,7 +52,6 @@ def test_a_large_sample_arrives_before_the_next_is_taken(tmp_path):
         thread.join()
         os.close(port)
         simulator.close()
-        stop.close()
     assert len(delays_us) == 3
     # Of three samples, at least one meets no pause of the machine.
     assert 0 <= min(delays_us) < period_us

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...config.skin import Skin
-from ...core.arrays import Array
 from ...core.errors import ConfigError
 from ..load import Resultant, StressField, total
 from .source import BodyContact, MujocoSkin, load_mujoco
@@ -105,7 +104,8 @@ class MujocoLoad:
                 calibration of each cube.
 
         Raises:
-            ConfigError: The scene cannot be read, or the skin does not fit it.
+            ConfigError: The scene cannot be read, its keyframes are not sorted by time, or the skin
+                does not fit it.
             ElasticError: The thickness is not above 0, or the cubes lie deeper than the layer.
         """
         self._mujoco = load_mujoco()
@@ -121,10 +121,10 @@ class MujocoLoad:
         self.poses = self.touch.poses
         self.depth = self.touch.depth
 
-        self._times, self._controls = _read_keyframe_controls(path, model)
-        self.repeats = None
-        if len(self._times):
-            self.repeats = float(self._times[-1])
+        if np.any(np.diff(model.key_time) < 0):
+            raise ConfigError(f"{path}: keyframes go back in time; sort them by their time")
+        # If all keyframes are at time 0, they are only named states and no motion.
+        self.repeats = float(max(model.key_time, default=0.0)) or None
         self.period = self.repeats or UNBOUNDED_PERIOD_S
         self._touches: dict[int, list[BodyContact]] = {}
         self._step = 0
@@ -174,11 +174,11 @@ class MujocoLoad:
         """Compute one step of the scene and keep its contacts."""
         model = self.touch.model
         data = self.touch.data
-        if len(self._times):
-            for actuator, controls in enumerate(self._controls.T):
+        if self.repeats is not None:
+            for actuator, controls in enumerate(model.key_ctrl.T):
                 data.ctrl[actuator] = np.interp(
                     data.time,
-                    self._times,
+                    model.key_time,
                     controls,
                 )
         self._mujoco.mj_step(model, data)
@@ -188,24 +188,3 @@ class MujocoLoad:
             kept_steps = round(KEPT_S / model.opt.timestep)
             oldest = self._step - kept_steps
             self._touches.pop(oldest, None)
-
-
-def _read_keyframe_controls(
-    path: Path,
-    model: MjModel,
-) -> tuple[Array, Array]:
-    """Return times (K,) in s and controls (K, actuators) of the keyframes.
-
-    Both are empty if all keyframes are at time 0.
-
-    Raises:
-        ConfigError: The keyframes are not sorted by time.
-    """
-    times = np.array(model.key_time)
-    if np.any(np.diff(times) < 0):
-        raise ConfigError(f"{path}: keyframes go back in time; sort them by their time")
-    # If all keyframes are at time 0, they are only named states and no motion.
-    if not len(times) or times[-1] <= 0:
-        return np.empty(0), np.empty((0, model.nu))
-    controls = np.array(model.key_ctrl)
-    return times, controls.reshape(len(times), model.nu)

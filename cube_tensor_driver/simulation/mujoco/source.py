@@ -30,8 +30,8 @@ MuJoCo is the extra `mujoco` of this package. It is imported when a skin is crea
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from functools import lru_cache
-from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -46,7 +46,7 @@ from ...core.rows import FrequencyRows, StressRows
 from ...mechanics.contact_tables import DiscTables, PolygonTables
 from ...mechanics.layer import Layer
 from ..cubes import PadErrors
-from ..imperfections import Imperfections
+from ..imperfections import NONE, Imperfections
 from ..load import ContactLoad, StressField, surface_normal
 from ..source import SkinPads
 from .patches import Polygon, hertz_radius, make_flat_contact, next_corners
@@ -170,8 +170,10 @@ class MujocoSkin:
         layer = Layer(thickness, poisson)
         self._discs, self._polygons = _make_tables(layer, round(self.depth, 6))
         self._stiffness = young / (1 - poisson**2)
-        self._curvature = _compute_curvatures(model, self._mujoco)
-        self._pads = SkinPads(skin, PadErrors(noise, drift, imperfections))
+        kinds = self._mujoco.mjtGeom
+        round_kinds = (kinds.mjGEOM_SPHERE, kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER)
+        self._round_kinds = {int(kind) for kind in round_kinds}
+        self._pads = SkinPads(skin, PadErrors(noise, drift, imperfections or NONE))
         self._reconstructor = Reconstructor(skin)
         self._scans = 0
 
@@ -192,23 +194,21 @@ class MujocoSkin:
 
     def touches(self) -> list[BodyContact]:
         """Return all contacts of the skin in the state of `data`."""
-        data = self.data
-        geoms = data.contact.geom[: data.ncon]
-        # A flexible body has no geom: its number is negative.
-        body_of_geom = self.model.geom_bodyid
-        bodies = np.where(geoms >= 0, body_of_geom[geoms], -1)
-
-        found: list[BodyContact] = []
-        for part in self._parts:
-            for side in (0, 1):
-                rows = np.flatnonzero(bodies[:, side] == part.body)
-                others = geoms[rows, 1 - side]
-                for other in np.unique(others):
-                    of_pair = rows[others == other]
-                    touch = self._find_touch(part, of_pair, side)
-                    if touch is not None:
-                        found.append(touch)
-        return found
+        # Contact points of each pair: body of the skin, whether it is the first (0) or the second
+        # (1) of the two bodies, and geom (shape) that touches it.
+        pairs = defaultdict(list)
+        geoms = self.data.contact.geom[: self.data.ncon]
+        for row, (first, second) in enumerate(geoms.tolist()):
+            for side, own, other in ((0, first, second), (1, second, first)):
+                # A flexible body has no geom: its number is negative.
+                body = self.model.geom_bodyid[own] if own >= 0 else -1
+                if body in self._parts:
+                    pairs[int(body), side, other].append(row)
+        found = [
+            self._find_touch(self._parts[body], np.array(rows), side)
+            for (body, side, _), rows in sorted(pairs.items())
+        ]
+        return [touch for touch in found if touch is not None]
 
     def field(self, touches: list[BodyContact]) -> StressField:
         """Compute stress and gradient at the cubes under contacts.
@@ -224,13 +224,11 @@ class MujocoSkin:
         stress = np.zeros((n, 6))
         gradient = np.zeros((n, 6, 3))
         # A contact causes stress only at the cubes of the body that is touched.
-        for part in self._parts:
+        for part in self._parts.values():
             own = [touch for touch in touches if touch.body == part.body]
             discs = [touch.press for touch in own if touch.polygon is None]
             flat = [touch for touch in own if touch.polygon is not None]
-            fields = []
-            if discs:
-                fields.append(_compute_field_of_discs(part, discs, self._discs))
+            fields = [_compute_field_of_discs(part, discs, self._discs)] if discs else []
             if flat:
                 fields.append(_compute_field_of_polygons(part, flat, self._polygons))
             for part_stress, part_gradient in fields:
@@ -286,9 +284,14 @@ class MujocoSkin:
                 radius,
             )
             return BodyContact(part.body, load, polygon)
-        # For a Hertz contact, the curvatures (1 / radius) of both bodies add up (Johnson 4.2).
-        geoms = self.data.contact.geom[rows[0]]
-        curvature = self._curvature[geoms].sum()
+        # For a Hertz contact, the curvatures (1 / radius) of both bodies add up (Johnson 4.2). That
+        # of other shapes is taken as 0.
+        model = self.model
+        curvature = sum(
+            1 / model.geom_size[geom, 0]
+            for geom in self.data.contact.geom[rows[0]].tolist()
+            if geom >= 0 and model.geom_type[geom] in self._round_kinds
+        )
         radius = hertz_radius(pressing, curvature, self._stiffness)
         return BodyContact(
             part.body,
@@ -334,11 +337,11 @@ class MujocoSkin:
         outward = -sign * frames[:, 0] @ to_parent.T
         return place, force, outward
 
-    def _attach(self) -> tuple[list[_BodyCubes], float]:
+    def _attach(self) -> tuple[dict[int, _BodyCubes], float]:
         """Find the body and the depth of each cube.
 
         Returns:
-            The cubes on each body, and the depth of all in m.
+            Number of a body -> its cubes; and the depth of all cubes in m.
 
         Raises:
             ConfigError: The skin does not fit the model.
@@ -361,17 +364,20 @@ class MujocoSkin:
 
         origin = reference.xpos[base]
         axes = reference.xmat[base].reshape(3, 3)
-        depth = np.empty(len(bodies))
-        for number, cube in enumerate(skin.cubes):
-            place = origin + axes @ self.poses.position[number]
-            outward = axes @ self.poses.rotation[number, :, 2]
-            depth[number] = self._measure_distance_to_surface(
-                reference,
-                int(bodies[number]),
-                place,
-                outward,
-                cube,
-            )
+        places = origin + self.poses.position @ axes.T
+        outward = self.poses.rotation[:, :, 2] @ axes.T
+        depth = np.array(
+            [
+                self._measure_distance_to_surface(reference, *cube)
+                for cube in zip(
+                    bodies.tolist(),
+                    places,
+                    outward,
+                    skin.cubes,
+                    strict=True,
+                )
+            ]
+        )
         # One table of stresses serves all cubes, so their depths must be nearly equal.
         median = float(np.median(depth))
         deviation = np.abs(depth - median)
@@ -384,21 +390,19 @@ class MujocoSkin:
                 "move cubes or geoms"
             )
 
-        parts = []
+        parts = {}
         for body in np.unique(bodies).tolist():
             cubes = np.flatnonzero(bodies == body)
             poses = CubePoses(*(column[cubes] for column in self.poses))
             to_world = reference.xmat[body].reshape(3, 3)
-            offset = reference.xpos[body] - origin
-            part = _BodyCubes(
+            parts[body] = _BodyCubes(
                 body,
                 cubes,
                 poses,
                 poses.pitch,
                 rotation=axes.T @ to_world,
-                position=axes.T @ offset,
+                position=axes.T @ (reference.xpos[body] - origin),
             )
-            parts.append(part)
         return parts, median
 
     def _find_body_number(self, name: str | None) -> int:
@@ -434,19 +438,16 @@ class MujocoSkin:
         first = model.body_geomadr[body]
         distances = []
         for geom in range(first, first + model.body_geomnum[body]):
-            if not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
-                continue  # it does not collide
             kind = model.geom_type[geom]
-            if kind == mujoco.mjtGeom.mjGEOM_MESH:
+            if not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
+                distance = -1.0  # it does not collide
+            elif kind == mujoco.mjtGeom.mjGEOM_MESH:
                 distance = mujoco.mj_rayMesh(model, reference, geom, place, outward)
             else:
-                position = reference.geom_xpos[geom]
-                rotation = reference.geom_xmat[geom]
-                size = model.geom_size[geom]
                 distance = mujoco.mju_rayGeom(
-                    position,
-                    rotation,
-                    size,
+                    reference.geom_xpos[geom],
+                    reference.geom_xmat[geom],
+                    model.geom_size[geom],
                     place,
                     outward,
                     kind,
@@ -545,18 +546,3 @@ def _compute_field_of_polygons(
         traction[:, number],
         twist[:, number],
     )
-
-
-def _compute_curvatures(model: MjModel, mujoco: ModuleType) -> Array:
-    """Return the curvature (geoms + 1,) of each geom (shape of a body) in 1/m.
-
-    It is 1 / radius for spheres, capsules and cylinders, and 0 for all others. The last entry, 0,
-    is for flexible bodies, which have no geom. `mujoco` is the module of this name.
-    """
-    kinds = mujoco.mjtGeom
-    round_kinds = (kinds.mjGEOM_SPHERE, kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER)
-    numbers = [int(kind) for kind in round_kinds]
-    rows = np.flatnonzero(np.isin(model.geom_type, numbers))
-    curvature = np.zeros(model.ngeom + 1)
-    curvature[rows] = 1 / model.geom_size[rows, 0]
-    return curvature
