@@ -18,12 +18,13 @@ import numpy as np
 
 from .arguments import check_skin
 from .arrays import Array, Index, Mask, PadMasks, StatusBits
-from .calibration import Calibration
+from .calibration import Calibration, tabulate_pads
 from .compensation.compensation import Compensation
 from .errors import TareError
 from .health.drift import DriftTracker
 from .health.health import Health
 from .health.tare import measure_rest
+from .modes import COMPONENTS
 from .pipeline import Pipeline
 from .rows import FrequencyRows, StressRows
 
@@ -106,6 +107,12 @@ class Reconstructor:
         self.drift_time = 0.0
         self._calibrated_rest = self.pipeline.rest_frequency
         self._drift = DriftTracker(self.health)
+        modulus, beta = (
+            tabulate_pads(calibrations, name, self.pipeline.n_pads, fill=0.0)
+            for name in ("modulus", "beta")
+        )
+        # Stress on each pad (cubes, P), in Pa, per relative change of its rest frequency.
+        self._stress_per_drift = modulus * (1 + beta)
 
     def __repr__(self) -> str:
         changes = f"{self.rest_changes} changes of rest frequencies"
@@ -211,17 +218,36 @@ class Reconstructor:
         could not be tracked. `Pipeline.covariance` states arguments and units.
         """
         covariance = self.pipeline.covariance(cube, left_out)
-        compensation = self.compensation.covariance(cube, left_out)
-        if compensation is not None:
-            covariance = covariance + compensation
-        if self._drift.deviation[cube]:
-            # The frequencies of all pads of a cube drift by about the same fraction, so the error
-            # looks like a pressure from all sides.
-            one = self.calibrations[cube]
-            pads = one.modulus * (1 + one.beta) * self._drift.deviation[cube]
-            components = self.pipeline.matrix(cube, left_out) @ pads
-            covariance = covariance + np.outer(components, components)
-        return covariance
+        errors = self.errors(np.array([cube]), np.array([left_out]))[0]
+        return covariance + errors @ errors.T if errors.any() else covariance
+
+    def errors(self, cubes: Index, left_out: PadMasks) -> Array:
+        """Return the errors (n, 15, k) of the newest rows of n cubes by k causes other than noise.
+
+        The causes are errors of the compensation, and drift that could not be tracked. They are
+        independent, and each column has the size of one standard deviation. The errors of different
+        cubes in one column are about fully correlated, because the cubes have the temperature and
+        the motion in common.
+
+        Args:
+            cubes: Numbers (n,) of the cubes.
+            left_out: Bit masks (n,) of the pads that are not used.
+
+        Returns:
+            Errors of 6 stresses in Pa and 9 gradients in Pa/m; NaN for components that the pads do
+            not determine.
+        """
+        # The frequencies of all pads of a cube drift by about the same fraction, so the error looks
+        # like a pressure from all sides.
+        drift = self._drift.deviation[cubes, None] * self._stress_per_drift[cubes]
+        on_pads = np.dstack([self.compensation.pad_errors(cubes), drift])
+        matrices = np.zeros((len(cubes), len(COMPONENTS), on_pads.shape[1]))
+        chosen = zip(cubes.tolist(), left_out.tolist(), strict=True)
+        for number, (cube, mask) in enumerate(chosen):
+            matrix = self.pipeline.matrix(cube, mask)
+            matrices[number, :, : matrix.shape[1]] = matrix
+        errors: Array = matrices @ on_pads
+        return errors
 
     def tare(
         self,

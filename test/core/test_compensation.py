@@ -91,6 +91,44 @@ def test_a_stated_deviation_of_the_response_enters_the_covariance():
     np.testing.assert_allclose(grown, np.outer(expected, expected), rtol=1e-5, atol=1e-6)
 
 
+def test_errors_of_cubes_with_other_pads_and_models_are_those_of_each_alone():
+    """With times, causes, powers and pads that other cubes do not have, and a pad left out."""
+    large = illustrative("cube")
+    few, many = np.arange(1.0, 9.0)[:, None], np.arange(1.0, 25.0)[:, None]
+    creep = CreepModel(
+        np.array([0.1, 2.0]), 0.01 * np.hstack([few, few]), RNG.normal(size=(1, 8, 2))
+    )
+    other = CreepModel(
+        np.array([2.0, 9.0]), 0.005 * np.hstack([many, many]), RNG.normal(size=(2, 24, 2))
+    )
+    thermal = ThermalModel(np.array(20.0), np.array([5.0]), few, 0.1 * few, np.hstack([few, -few]))
+    bent = ThermalModel(np.array(20.0), np.array([3.0]), np.hstack([many, many]), np.ones((24, 2)))
+    cubes = [
+        replace(HEAVY, creep=creep, thermal=thermal),
+        replace(large, creep=other, thermal=bent),
+        PLAIN,
+    ]
+    together = Reconstructor(cubes, np.float64)
+    alone = [Reconstructor([one], np.float64) for one in cubes]
+    for k in range(30):
+        forces, warm = np.full((3, 3), [1.0, -2.0, 9.0]), 20.0 + 0.1 * k
+        frequency = np.full((3, 24), np.nan)
+        for c, one in enumerate(cubes):
+            frequency[c, : one.gain.size] = one.rest_frequency * (1 + 1e-4 * k)
+        known = {"stamp_ns": 10**9 + 50_000_000 * k, "temperature": warm}
+        number = np.arange(3, dtype=np.uint16)
+        together(FrequencyRows.of(number, frequency, specific_force=forces, **known))
+        for c, one in enumerate(alone):
+            own = frequency[c : c + 1, : cubes[c].gain.size]
+            one(FrequencyRows.of(number[:1], own, specific_force=forces[:1], **known))
+    errors = together.errors(np.arange(3), np.array([1, 2, 0]))
+    assert not errors[2][np.isfinite(errors[2])].any()
+    for c, mask in enumerate([1, 2]):
+        grown = alone[c].covariance(0, mask) - alone[c].pipeline.covariance(0, mask)
+        assert np.nanmax(grown) > 100
+        np.testing.assert_allclose(errors[c] @ errors[c].T, grown, rtol=1e-4, atol=1e-2)
+
+
 def test_scans_at_once_are_the_scans_one_by_one_to_the_bit():
     """With pads that fail, forces that are missing, and cubes of other calibrations."""
     forces = 20 * RNG.normal(size=(60, 3))

@@ -24,7 +24,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..arrays import Array, Mask, PadMasks, Real
+from ..arrays import Array, Index, Mask, PadMasks, Real
 from ..errors import LayoutError
 from ..health.health import Health
 from ..kernel.contract import Columns, Offsets
@@ -145,30 +145,23 @@ class Compensation:
             bits = np.where(effect.is_known, effect.bit, COMPENSATION)
             self.offsets.lasting[:] |= bits.astype(np.uint16)
 
-    def covariance(self, cube: int, left_out: int = 0) -> Array | None:
-        """Return the covariance (15, 15) of a cube's newest row that errors of compensation cause.
+    def pad_errors(self, cubes: Index) -> Array:
+        """Return the errors (n, P, k) of compensation by k independent causes, in Pa.
 
-        The covariance by the noise of the pads must be added to it.
+        They belong to the newest rows of n cubes. Each column has the size of one standard
+        deviation; k is 0 while nothing is compensated.
 
         Args:
-            cube: Number of the cube.
-            left_out: Bit mask of the pads that are not used.
-
-        Returns:
-            Covariance in the units of `Pipeline.covariance`; None if no error is known.
+            cubes: Numbers of the cubes.
         """
-        errors = [effect.deviation(cube) for effect in self._lasting]
+        errors = [np.zeros((len(cubes), self._pipeline.n_pads, 0))]
+        errors += [effect.errors(cubes) for effect in self._lasting]
         if self._has_forces:
-            force = self.offsets.newest_force[cube]
-            errors.append(self._weight.deviation(cube, force))
-        if not any(error.any() for error in errors):
-            return None
-        matrix = self._pipeline.matrix(cube, left_out)
-        n_pads = matrix.shape[1]
-        on_pads = np.hstack(errors)[:n_pads]
-        on_components = matrix @ on_pads
-        covariance: Array = on_components @ on_components.T
-        return covariance
+            force = self.offsets.newest_force[cubes].astype(float)
+            errors.append(self._weight.errors(cubes, force))
+        # The stiffness of a pad that a cube does not have is NaN.
+        found: Array = np.nan_to_num(np.concatenate(errors, axis=2))
+        return found
 
     def states(self) -> dict[str, Array]:
         """Return the state of creep and of temperature that earlier rows caused, by name, as (n,).

@@ -90,6 +90,15 @@ class Creep:
             places = np.searchsorted(self._times, model.time)
             self._amplitude[places, : model.n_pads, cube] = model.amplitude.T
         self._total = self._amplitude.sum(axis=0)
+        # Errors of the amplitudes by independent causes (C, causes, P, K).
+        stated = [model.deviation for model in self._models if model is not None]
+        n_causes = max((len(one) for one in stated if one is not None), default=0)
+        self._amplitude_errors = np.zeros((n_cubes, n_causes, n_pads, len(self._times)))
+        for cube, model in enumerate(self._models):
+            if model is not None and model.deviation is not None:
+                places = np.searchsorted(self._times, model.time)
+                own = self._amplitude_errors[cube, : len(model.deviation), : model.n_pads]
+                own[:, :, places] = model.deviation
         self._stiffness = pipeline.stiffness
         self._rest = pipeline.rest_frequency
         self._rest_version = pipeline.rest_changes
@@ -198,39 +207,26 @@ class Creep:
         for k, amplitude in enumerate(self._amplitude):
             self._full_gain += amplitude * of_change[k]
 
-    def deviation(self, cube: int) -> Array:
-        """Return the errors (P, k) of a cube's computed creep by k independent causes, in Pa.
+    def errors(self, cubes: Index) -> Array:
+        """Return the errors (n, P, k) of the computed creep of n cubes, in Pa.
 
-        The causes are unknown earlier loads and errors of the law of creep. Each column has the
-        size of one standard deviation.
+        The k independent causes are unknown earlier loads and errors of the law of creep. Each
+        column has the size of one standard deviation.
         """
-        model = self._models[cube]
-        reading = self._reading[:, cube]
-        if model is None:
-            return np.zeros((len(reading), 0))
-        stiffness = self._stiffness[cube]
-        unknown = self._find_unknown(np.array([cube]))
-        errors = [unknown[0]]
+        stiffness = self._stiffness[cubes]
+        unknown = self._find_unknown(cubes)
         _, _, is_gap = self._find_gaps()
-        if is_gap[cube]:
-            # Before its newest row, the cube had a gap without rows, over which the filters have
-            # not been advanced yet. Until they are, the whole of the creep counts as unknown.
-            newest = np.nan_to_num(self._newest.reading[cube])
-            before = np.abs(reading)
-            larger = np.maximum(before, np.abs(newest))
-            largest = self._total[:, cube] * larger * stiffness
-            errors = [largest * UNIFORM_DEVIATION]
-        if model.deviation is not None:
-            places = np.searchsorted(self._times, model.time)
-            memory = reading - self._memories.lag[places, :, cube]
-            pads = slice(model.n_pads)
-            amplitude = model.deviation.swapaxes(1, 2)
-            products = amplitude * memory[:, pads]
-            known = products.sum(axis=1) * stiffness[pads]
-            n_missing = len(reading) - model.n_pads
-            padded = np.pad(known, [(0, 0), (0, n_missing)])
-            errors.extend(padded)
-        return np.stack(errors, axis=1)
+        # If a cube had a gap without rows before its newest row, the filters have not been advanced
+        # over it yet. Until they are, the whole of the creep counts as unknown.
+        newest = np.nan_to_num(self._newest.reading[cubes])
+        before = np.abs(self._reading.T[cubes])
+        larger = np.maximum(before, np.abs(newest))
+        largest = self._total.T[cubes] * larger * stiffness
+        unknown = np.where(is_gap[cubes, None], largest * UNIFORM_DEVIATION, unknown)
+        memory = (self._reading - self._memories.lag).T[cubes]
+        by_law = np.einsum("nspk,npk->nps", self._amplitude_errors[cubes], memory)
+        errors = np.dstack([unknown, by_law * stiffness[:, :, None]])
+        return np.asarray(errors)
 
     def _update_certainty(self) -> None:
         """Mark the creep of a cube as certain again if the error by unknown loads is small enough.

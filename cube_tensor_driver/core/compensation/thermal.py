@@ -14,13 +14,16 @@ the skin, P the largest number of pads of a cube.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from ..arrays import Array, index_cubes
+from ..arrays import Array, Index, index_cubes
 from ..kernel.contract import Columns
 from ..pipeline import Pipeline
 from ..status import THERMAL
 from .low_pass import MAX_STEP_NS, LowPass
+from .models import ThermalModel
 
 START_KELVIN = 1.0
 """Standard deviation, in K, of the difference between elastomer and thermometer at the first row.
@@ -92,6 +95,15 @@ class Thermal:
             self._slope[number] = _find_typical_size(model.coefficient[:, :1])
             if model.ramp is not None:
                 self._ramp[number] = _find_typical_size(model.ramp)
+        # Errors (C, P, k) of the stresses, in Pa per K (or power of K), by the attribute of the
+        # model that states them.
+        ramps = [model.ramp for model in present if model.ramp is not None]
+        n_ramps = max((ramp.shape[1] for ramp in ramps), default=0)
+        widths = {"coefficient": 1, "ramp": n_ramps, "deviation": n_degrees}
+        self._error_sizes = {
+            name: _stack(self._models, name, (len(stiffness), width))
+            for name, width in widths.items()
+        }
         self._coefficient /= stiffness
         self._filters = LowPass(times, n_signals=1)
 
@@ -162,31 +174,26 @@ class Thermal:
         is_accurate = lag_deviation + start_deviation <= MAX_DEVIATION
         self.is_known = self.has_model & is_accurate
 
-    def deviation(self, cube: int) -> Array:
-        """Return the errors (P, k) of the thermal stress on the P pads of a cube, in Pa.
+    def errors(self, cubes: Index) -> Array:
+        """Return the errors (n, P, k) of the thermal stress on the pads of n cubes, in Pa.
 
         Each of the k columns is the error, of one standard deviation, by one of k independent
         causes: the unknown temperature of the elastomer, its lag behind the thermometer, and the
         coefficients of the calibration. If no temperature has been measured yet, the reference
         temperature is assumed, with a standard deviation of 5 K.
         """
-        model = self._models[cube]
-        n_pads = len(self.offset)
-        if model is None:
-            return np.zeros((n_pads, 0))
-        lag = self._lag[cube]
-        unknown = LOST_KELVIN if np.isnan(lag) else self._unknown[cube]
-        errors = [model.coefficient[:, :1] * unknown]
-        if model.ramp is not None:
-            errors.append(model.ramp * np.nan_to_num(lag))
-        if model.deviation is not None:
-            n_degrees = model.deviation.shape[1]
-            powers = 1 + np.arange(n_degrees)
-            level_powers = self._level[cube] ** powers
-            errors.append(model.deviation * level_powers)
-        found = np.hstack(errors)
-        n_missing = n_pads - len(found)
-        return np.pad(found, [(0, n_missing), (0, 0)])
+        lag = self._lag[cubes]
+        unknown = np.where(np.isnan(lag), LOST_KELVIN, self._unknown[cubes])
+        powers = 1 + np.arange(len(self._coefficient))
+        factors = {
+            "coefficient": unknown[:, None],
+            "ramp": np.nan_to_num(lag)[:, None],
+            "deviation": self._level[cubes][:, None] ** powers,
+        }
+        errors = [
+            self._error_sizes[name][cubes] * factor[:, None] for name, factor in factors.items()
+        ]
+        return np.concatenate(errors, axis=2)
 
     def parts(self) -> list[Array]:
         """Return the arrays of the state. To restore a recorded state, write into them."""
@@ -196,6 +203,23 @@ class Thermal:
             self._unknown,
             self._filters.lag,
         ]
+
+
+def _stack(models: Sequence[ThermalModel | None], name: str, shape: tuple[int, int]) -> Array:
+    """Return an attribute (P, k) of the models of C cubes as (C, P, k); 0 where a model has none.
+
+    Args:
+        models: Models of the cubes.
+        name: Name of the attribute.
+        shape: Numbers P of pads and k of columns; further columns are left out.
+    """
+    stacked = np.zeros((len(models), *shape))
+    for number, model in enumerate(models):
+        value = getattr(model, name, None)
+        if value is not None:
+            part = value[:, : shape[1]]
+            stacked[number, : len(part), : part.shape[1]] = part
+    return stacked
 
 
 def _find_typical_size(values: Array) -> float:

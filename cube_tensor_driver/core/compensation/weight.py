@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..arrays import Array
+from ..arrays import Array, Index
 from ..pipeline import Pipeline
 
 STANDARD_GRAVITY = 9.80665
@@ -42,17 +42,18 @@ class Weight:
             if model.deviation is not None:
                 self._deviation[number, :, pads] = gain * model.deviation.T
 
-    def deviation(self, cube: int, force: Array) -> Array:
-        """Return the errors (P, 3) of the compensation of weight by independent causes, in Pa.
+    def errors(self, cubes: Index, force: Array) -> Array:
+        """Return the errors (n, P, 3) of the compensation of weight by independent causes, in Pa.
 
         The causes are the three axes. Each column has the size of one standard deviation. An
         unknown specific force is taken as 0 with a standard deviation of 1 g along each axis.
 
         Args:
-            cube: Number of the cube.
-            force: Its newest specific force (3,), in m/s²; NaN: unknown.
+            cubes: Numbers of n cubes.
+            force: Their newest specific forces (n, 3), in m/s²; NaN: unknown.
         """
-        errors: Array = self._deviation[cube].T * force
-        if np.isnan(force).any():
-            errors = self.response[cube].T * STANDARD_GRAVITY
+        known = self._deviation[cubes] * force[:, :, None]
+        unknown = self.response[cubes] * STANDARD_GRAVITY
+        is_unknown = np.isnan(force.sum(axis=1, keepdims=True))
+        errors: Array = np.where(is_unknown[:, None], unknown, known).swapaxes(1, 2)
         return errors
