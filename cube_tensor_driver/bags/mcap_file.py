@@ -10,20 +10,21 @@ one read per chunk instead of several per message. Source of the format: https:/
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from io import SEEK_END, BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 from zlib import crc32
 
 import numpy as np
+import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, SeekingReader
-from mcap.records import Chunk, Footer
+from mcap.records import Chunk, Footer, McapRecord
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.summary import Summary
 from mcap.writer import CompressionType, Writer
@@ -95,6 +96,9 @@ CHECKSUM_BYTES = 4
 the summary (topics and offsets of chunks)."""
 
 
+_Record = TypeVar("_Record", bound=McapRecord)
+
+
 class McapReader:
     """An MCAP file open for reading.
 
@@ -107,27 +111,35 @@ class McapReader:
         """Open a file and read its summary (topics, and the offset of each chunk of messages).
 
         Raises:
-            OSError, McapError, ValueError, struct.error: The file cannot be read, its summary is
-                damaged, or it has no summary because the recording was cut off.
+            OSError: The file cannot be read.
+            McapError, ConfigError: Its summary is damaged, or it has none because the recording was
+                cut off.
         """
         self._stream = path.open("rb")
         # The checksum is checked first, because it covers every offset and length used below.
         try:
             _check_summary(self._stream)
             self._stream.seek(0)
-            index = SeekingReader(
+            reader = SeekingReader(
                 self._stream,
                 validate_crcs=True,
                 record_size_limit=MAX_CHUNK_BYTES,
-            ).get_summary()
+            )
+            with report_parse_errors():
+                index = reader.get_summary()
             # Only the statistics record of the summary states how many messages the file should
             # have. Without this record, lost messages would not be noticed.
             if index is None or index.statistics is None:
                 raise McapError("the file has no summary")
-            sizes = [chunk.uncompressed_size for chunk in index.chunk_indexes]
-            largest = max(sizes, default=0)
-            if largest > MAX_CHUNK_BYTES:
-                raise McapError(f"a chunk of {largest} bytes, the limit is {MAX_CHUNK_BYTES}")
+            for chunk in index.chunk_indexes:
+                room = path.stat().st_size - chunk.chunk_start_offset
+                if not RECORD_HEAD.size <= chunk.chunk_length <= room:
+                    raise McapError("a chunk lies outside of the file")
+                if chunk.uncompressed_size > MAX_CHUNK_BYTES:
+                    raise McapError(
+                        f"a chunk of {chunk.uncompressed_size} bytes, the limit is "
+                        f"{MAX_CHUNK_BYTES}"
+                    )
         except BaseException:
             self._stream.close()
             raise
@@ -214,10 +226,7 @@ class McapReader:
             All messages of the chunk in the order of their times.
         """
         self._stream.seek(offset + RECORD_HEAD.size)
-        # Parsing a copy of the record limits what a damaged length inside it can request: reading
-        # stops at the end of the record instead of allocating any amount of memory.
-        record = BytesIO(self._stream.read(length - RECORD_HEAD.size))
-        data = unpack_chunk(Chunk.read(ReadDataStream(record)))
+        _, data = read_chunk(self._stream.read(length - RECORD_HEAD.size))
         # This loop finds where the records of the chunk begin, because the library mcap takes many
         # times as long. A rest of the chunk that is shorter than the head of a message record
         # contains no message, so the search stops before it.
@@ -271,15 +280,18 @@ class McapReader:
             validate_crcs=True,
             record_size_limit=MAX_CHUNK_BYTES,
         )
-        return join_in_blocks(
-            (channel.id, message.log_time, message.data)
-            for _, channel, message in reader.iter_messages(
-                topics,
-                log_time_order=False,
-                starting_at=start_ns,
-                ending_before=stop_ns,
-            )
-        )
+
+        def read() -> Iterator[tuple[int, int, bytes]]:
+            with report_parse_errors():
+                for _, channel, message in reader.iter_messages(
+                    topics,
+                    log_time_order=False,
+                    starting_at=start_ns,
+                    ending_before=stop_ns,
+                ):
+                    yield channel.id, message.log_time, message.data
+
+        return join_in_blocks(read())
 
 
 class McapWriter:
@@ -367,20 +379,53 @@ class McapWriter:
             self._stream.close()
 
 
-def unpack_chunk(chunk: Chunk) -> bytes:
-    """Decompress a chunk (block of messages) of an MCAP file and check its checksum.
+@contextmanager
+def report_parse_errors() -> Iterator[None]:
+    """Turn the errors that the library mcap lets escape for damaged bytes into a McapError."""
+    try:
+        yield
+    except (
+        struct.error,  # too few bytes
+        ValueError,  # a wrong checksum, opcode or text
+        KeyError,  # a channel without its schema
+        OverflowError,  # an impossible length
+        RuntimeError,  # damaged data, from lz4
+        zstandard.ZstdError,
+    ) as error:
+        raise McapError(str(error) or type(error).__name__) from None
 
-    Returns:
-        The records of the chunk as bytes, one after the other.
+
+def parse_record(read: Callable[[ReadDataStream], _Record], content: bytes) -> _Record:
+    """Parse an MCAP record.
+
+    Args:
+        read: Method `read` of the record's class in the library mcap.
+        content: The record without its opcode and length. Reading stops at its end, whatever a
+            damaged length inside it says.
 
     Raises:
-        McapError, ValueError, zstandard.ZstdError: The chunk is damaged.
+        McapError: The record is damaged.
     """
-    try:
+    with report_parse_errors():
+        return read(ReadDataStream(BytesIO(content)))
+
+
+def read_chunk(content: bytes) -> tuple[Chunk, bytes]:
+    """Parse a chunk (block of messages) of an MCAP file, decompress it and check its checksum.
+
+    Args:
+        content: The chunk record without its opcode and length.
+
+    Returns:
+        The chunk, and its records as bytes, one after the other.
+
+    Raises:
+        McapError: The chunk is damaged.
+    """
+    chunk = parse_record(Chunk.read, content)
+    with report_parse_errors():
         stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-        return stream.read(size)
-    except RuntimeError as error:  # the library lz4 raises it for damaged data
-        raise McapError(str(error)) from None
+    return chunk, stream.read(size)
 
 
 def rosbag2_metadata(file: FileSummary) -> dict[str, str]:
@@ -415,7 +460,7 @@ def read_connections(index: Summary) -> dict[int, Connection]:
         found[number] = Connection(
             channel.topic,
             schema.name if schema else "",
-            schema.data.decode() if schema and has_text else "",
+            schema.data.decode(errors="replace") if schema and has_text else "",
             parse_profiles(channel.metadata.get("offered_qos_profiles", ""), channel.topic),
             counts.get(number, 0),
         )
@@ -437,12 +482,13 @@ def _check_summary(stream: BinaryIO) -> None:
     tail = stream.read()
     if tail_start < 0 or not tail.endswith(MCAP_MAGIC):
         raise McapError("the file does not end as an MCAP file does")
-    footer = Footer.read(ReadDataStream(BytesIO(tail[RECORD_HEAD.size :])))
+    footer = parse_record(Footer.read, tail[RECORD_HEAD.size :])
     if not footer.summary_crc:  # 0 states that the writing program computed no checksum
         return
     # The checksum covers the summary and that part of the footer which precedes the checksum.
     end = size - len(MCAP_MAGIC) - CHECKSUM_BYTES
-    stream.seek(footer.summary_start)
-    checked = stream.read(max(0, end - footer.summary_start))
+    start = min(footer.summary_start, end)
+    stream.seek(start)
+    checked = stream.read(end - start)
     if crc32(checked) != footer.summary_crc:
         raise McapError("the summary does not have its checksum")

@@ -147,9 +147,11 @@ def parse_profiles(text: str, topic: str) -> Sequence[QosProfile]:
         topic: Name of the topic, for error messages.
 
     Raises:
-        ConfigError: The text is not YAML.
+        ConfigError: The text is not a list of mappings in YAML.
     """
-    profiles: list[QosProfile] = parse_yaml(text or "[]", topic)
+    profiles: object = parse_yaml(text or "[]", topic)
+    if not isinstance(profiles, list) or not all(isinstance(one, dict) for one in profiles):
+        raise ConfigError(f"{topic}: its quality of service profiles are no list of mappings")
     return profiles
 
 
@@ -182,7 +184,8 @@ def find_type_hash(msgtype: str, definition: str) -> str:
     try:
         store.register(get_types_from_msg(definition, msgtype))
         return store.hash_rihs01(msgtype)
-    except (TypesysError, SerdeError, KeyError):
+    except (TypesysError, SerdeError, KeyError, SyntaxError):
+        # rosbags generates Python code from the definition, which a damaged name makes invalid.
         return ""
 
 
@@ -205,22 +208,29 @@ def read_metadata(folder: Path) -> tuple[list[Path], str]:
         )
     # Only file names and compression are taken from metadata.yaml. Topics and times are taken from
     # the storage files, which also state them.
-    reason = "damaged"
+    advice = f"./cube bag repair {folder} writes it again"
     try:
         text = _TOPICS.sub(b"", read_bounded(path, "metadata of a bag"))
-        about = parse_yaml(text, str(path))["rosbag2_bagfile_information"]
-        if (version := about.get("version", 0)) > METADATA_VERSION:
-            reason = f"its version {version} is newer than {METADATA_VERSION}, the newest known one"
-            _log.warning("%s: %s", path, reason)
-        names = about["relative_file_paths"]
-        mode = str(about.get("compression_mode") or "").lower()
-        # Some versions of rosbag2 write "folder/file" instead of the name of the file.
-        paths = [folder / Path(name).name for name in names]
-    except (OSError, ConfigError, KeyError, TypeError, AttributeError) as error:
-        raise BagError(
-            f"{path}: {reason} ({error}); ./cube bag repair {folder} writes it again"
-        ) from None
-    return paths, mode
+        document = parse_yaml(text, str(path))
+    except (OSError, ConfigError) as error:
+        raise BagError(f"{path}: damaged ({error}); {advice}") from None
+    about = _as_mapping(_as_mapping(document).get("rosbag2_bagfile_information"))
+    reason = "damaged (it names no files)"
+    version = about.get("version")
+    if isinstance(version, int) and version > METADATA_VERSION:
+        reason = f"its version {version} is newer than {METADATA_VERSION}, the newest known one"
+        _log.warning("%s: %s", path, reason)
+    names = about.get("relative_file_paths")
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise BagError(f"{path}: {reason}; {advice}")
+    # Some versions of rosbag2 write "folder/file" instead of the name of the file.
+    paths = [folder / Path(name).name for name in names]
+    return paths, str(about.get("compression_mode") or "").lower()
+
+
+def _as_mapping(value: object) -> dict[object, object]:
+    """Return a value of a YAML text if it is a mapping, otherwise an empty mapping."""
+    return value if isinstance(value, dict) else {}
 
 
 def write_metadata(

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import logging
 import sqlite3
-import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import zstandard
@@ -37,6 +36,7 @@ from .stored_messages import StoredMessages, join_in_blocks
 
 if TYPE_CHECKING:
     from rosbags.interfaces.typing import Fielddefs
+    from std_msgs.msg import Header
 
     from ..msg import SkinInfo
 
@@ -80,23 +80,14 @@ Without this block it would return the arrays of every batch to the operating sy
 time.
 """
 
-READ_ERRORS = (
+DAMAGE_ERRORS = (
     McapError,
     sqlite3.Error,
     zstandard.ZstdError,
-    SerdeError,
     TypesysError,
     ConfigError,
-    struct.error,
-    ValueError,
-    KeyError,
-    OverflowError,
 )
-"""Exceptions that the libraries raise when they read a damaged storage file of a bag.
-
-`struct.error`, `ValueError` and `OverflowError` come from impossible numbers, texts and lengths,
-`KeyError` from a topic or message type that is used but not defined in the file.
-"""
+"""Exceptions of the libraries, and of this package's YAML reader, for damaged files of a bag."""
 
 _log = logging.getLogger(__name__)
 
@@ -119,7 +110,7 @@ def report_damage(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise BagError(f"{path}: {error.strerror or error}; name a bag that can be read") from None
-    except READ_ERRORS as error:
+    except DAMAGE_ERRORS as error:
         raise BagError(
             f"{path}: damaged, or no bag ({_join_lines(error)}); "
             f"./cube bag repair {path} may help if it was cut off"
@@ -166,22 +157,29 @@ def check_storage_path(path: Path) -> None:
         )
 
 
-def make_message(kind: str, **fields: Any) -> Any:
+class StampedMessage(Protocol):
+    """A message with a header, of the library rosbags or of ROS."""
+
+    header: Header
+
+
+def make_message(kind: str, **fields: object) -> object:
     """Make a message object of the library rosbags.
 
     Args:
         kind: Name of the message type, such as ``std_msgs/msg/String``.
         fields: Value of each field of the message.
     """
-    return make_typestore().types[kind](**fields)
+    make: Callable[..., object] = make_typestore().types[kind]
+    return make(**fields)
 
 
-def serialise(message: Any) -> bytes:
+def serialise(kind: str, message: object) -> bytes:
     """Return the bytes (CDR) of a message that `make_message` made or `Bag.decoded` read."""
-    return bytes(make_typestore().serialize_cdr(message, message.__msgtype__))
+    return bytes(make_typestore().serialize_cdr(message, kind))
 
 
-def stamp_ns(message: Any) -> int:
+def stamp_ns(message: StampedMessage) -> int:
     """Return the stamp in a message's header, in ns since the Unix epoch."""
     stamp = message.header.stamp
     return int(stamp.sec) * SECOND + int(stamp.nanosec)
@@ -371,10 +369,10 @@ class Bag:
         for channel, time_ns, data in messages:
             try:
                 yield channel, time_ns, _decompress(data)
-            except READ_ERRORS as error:
+            except (zstandard.ZstdError, MessageError) as error:
                 self.skip(file.connections[channel].topic, time_ns, error)
 
-    def decoded(self, topics: set[str]) -> Iterator[tuple[int, Any]]:
+    def decoded(self, topics: set[str]) -> Iterator[tuple[int, object]]:
         """Read messages as objects, in the order of recording; damaged ones are left out.
 
         Yields:
@@ -383,10 +381,13 @@ class Bag:
         Raises:
             BagError: A file of the bag is damaged.
         """
+        store = make_typestore()
         for entry in self.entries(topics):
             try:
-                message = make_typestore().deserialize_cdr(entry.data, entry.msgtype)
-            except READ_ERRORS as error:
+                if entry.msgtype not in store.fielddefs:
+                    raise SerdeError(f"the type {entry.msgtype} is not known")
+                message = store.deserialize_cdr(entry.data, entry.msgtype)
+            except SerdeError as error:
                 self.skip(entry.topic, entry.time_ns, error)
             else:
                 yield entry.time_ns, message
@@ -425,7 +426,7 @@ class Bag:
         Raises:
             BagError: No message can be read, or all have another version than `VERSION`.
         """
-        read = list(self.decoded({topic}))
+        read: list[tuple[int, SkinInfo]] = list(self.decoded({topic}))
         if not read:
             raise BagError(
                 f"{self.path}: no message on {topic} that can be read: the bag does not say what "
@@ -501,50 +502,49 @@ class Bag:
             The result of `decode` for M messages, and an array (M,) of the times at which they were
             recorded, in ns since the Unix epoch.
         """
-        # Decoding many messages with one call of numpy takes hardly longer than decoding one.
-        waiting: list[AnyArray] = []
-        times_ns: list[Times] = []
-        shape: tuple[int, bytes] = 0, b""
-        limit = room = 0
-
-        def decode_waiting() -> Iterator[tuple[_Batch, Times]]:
-            """Decode the collected messages together or, if one is damaged, each alone."""
-            together, at_ns = np.concatenate(waiting), np.concatenate(times_ns)
+        for messages, times_ns in self._read_batches(topic, codec):
             try:
-                yield decode(together), at_ns
+                yield decode(messages), times_ns
             except MessageError:
                 # One message is damaged, but the others are not, so each is decoded alone.
-                for number, time_ns in enumerate(at_ns.tolist()):
+                for number, time_ns in enumerate(times_ns.tolist()):
                     one = slice(number, number + 1)
                     try:
-                        yield decode(together[one]), at_ns[one]
+                        yield decode(messages[one]), times_ns[one]
                     except MessageError as error:
                         self.skip(topic, time_ns, error)
 
+    def _read_batches(
+        self,
+        topic: str,
+        codec: MessageCodec[FrequencyRows] | MessageCodec[StressRows],
+    ) -> Iterator[tuple[AnyArray, Times]]:
+        """Yield bytes (M, length) and times of recording (M,) of messages of equal shape.
+
+        Decoding many messages with one call of numpy takes hardly longer than decoding one.
+        """
+        waiting: list[tuple[AnyArray, Times]] = []
+        shape: tuple[int, bytes] = 0, b""
+        room = 0
         for _, stored in self._read_stored({topic}):
-            for at_ns, messages in stored.equally_long():
+            for times_ns, messages in stored.equally_long():
                 first = messages[0].tobytes()
                 new_shape = len(first), codec.shape_bytes(first)
-                if new_shape != shape:
-                    if waiting:
-                        yield from decode_waiting()
-                    waiting, times_ns, shape = [], [], new_shape
-                    # The last 4 bytes of the shape are the number of rows in the message.
-                    rows = int.from_bytes(shape[1][-4:], "little")
-                    fitting = MAX_BATCH_ROWS // max(1, rows)
-                    room = limit = max(1, min(MAX_BATCH_MESSAGES, fitting))
                 begin = 0
                 while begin < len(messages):
+                    if new_shape != shape or not room:
+                        yield from _join_batch(waiting)
+                        waiting, shape = [], new_shape
+                        # The last 4 bytes of the shape are the number of rows in the message.
+                        rows = int.from_bytes(shape[1][-4:], "little")
+                        fitting = MAX_BATCH_ROWS // max(1, rows)
+                        room = max(1, min(MAX_BATCH_MESSAGES, fitting))
                     part = slice(begin, begin + room)
-                    waiting.append(messages[part])
-                    times_ns.append(at_ns[part])
-                    begin += len(waiting[-1])
-                    room -= len(waiting[-1])
-                    if not room:
-                        yield from decode_waiting()
-                        waiting, times_ns, room = [], [], limit
-        if waiting:
-            yield from decode_waiting()
+                    waiting.append((messages[part], times_ns[part]))
+                    n_taken = len(messages[part])
+                    begin += n_taken
+                    room -= n_taken
+        yield from _join_batch(waiting)
 
     def _unpack_files(self, paths: Sequence[Path]) -> list[Path]:
         """Decompress storage files that rosbag2 compressed as a whole.
@@ -591,6 +591,13 @@ class Bag:
         )
 
 
+def _join_batch(parts: Sequence[tuple[AnyArray, Times]]) -> Iterator[tuple[AnyArray, Times]]:
+    """Yield the parts of a batch (bytes and times of recording) as one part, if there are any."""
+    if parts:
+        messages, times_ns = zip(*parts, strict=True)
+        yield np.concatenate(messages), np.concatenate(times_ns)
+
+
 def message_fields(msgtype: str) -> Fielddefs:
     """Return name and kind of each field of a message type, as the library rosbags states them.
 
@@ -623,7 +630,8 @@ def _decompress(data: bytes) -> bytes:
     """Decompress a message that rosbag2 compressed with zstd.
 
     Raises:
-        zstandard.ZstdError, ValueError: The message is damaged, or has more than
+        zstandard.ZstdError: The message is damaged.
+        MessageError: It has more than
             `MAX_MESSAGE_BYTES` after decompression.
     """
     # A stream is read up to the limit. Decompression in one step would allocate whatever size the
@@ -631,5 +639,5 @@ def _decompress(data: bytes) -> bytes:
     with zstandard.ZstdDecompressor().stream_reader(data) as reader:
         message = reader.read(MAX_MESSAGE_BYTES + 1)
     if len(message) > MAX_MESSAGE_BYTES:
-        raise ValueError(f"a compressed message has more than {MAX_MESSAGE_BYTES} bytes")
+        raise MessageError(f"a compressed message has more than {MAX_MESSAGE_BYTES} bytes")
     return bytes(message)

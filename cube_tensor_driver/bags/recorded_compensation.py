@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from ..core.arrays import Array
 from ..core.compensation.motion import UNKNOWN_MOTION, ForcesAtCubes, Motion
@@ -22,6 +22,9 @@ from ..messages.codec import Decoded
 from ..messages.compensation import read_motion, read_states
 from ..messages.types import COMPENSATION
 from .read import MAX_DISORDER_NS, Bag, stamp_ns
+
+if TYPE_CHECKING:
+    from ..msg import SkinCompensation
 
 
 class RecordedCompensation(NamedTuple):
@@ -134,6 +137,7 @@ class CompensationReader:
     def _read(self) -> Iterator[tuple[int, RecordedCompensation]]:
         """Yield the stamp (in ns) and content of each message on `compensation`, as recorded."""
         topics = {self._topic} if self.is_recorded else set()
+        message: SkinCompensation
         for time_ns, message in self._bag.decoded(topics):
             at_ns = stamp_ns(message)
             try:

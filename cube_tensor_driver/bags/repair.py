@@ -21,18 +21,19 @@ import shutil
 import sqlite3
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, suppress
+from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, TypeVar
+from typing import BinaryIO, NamedTuple
 from zlib import crc32
 
-from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.data_stream import RecordBuilder
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import (
     Channel,
-    Chunk,
     ChunkIndex,
     DataEnd,
     Footer,
@@ -52,12 +53,13 @@ from .mcap_file import (
     RECORD_HEAD,
     ROSBAG2_RECORD,
     McapReader,
+    parse_record,
+    read_chunk,
     rosbag2_metadata,
     summarise,
-    unpack_chunk,
 )
-from .metadata import FILE_NAME, SUFFIXES, FileSummary, read_metadata, write_metadata
-from .read import READ_ERRORS, check_storage_path, open_storage, report_damage
+from .metadata import FILE_NAME, SUFFIXES, read_metadata, write_metadata
+from .read import DAMAGE_ERRORS, check_storage_path, open_storage, report_damage
 
 _DATED_NAME = re.compile(r"(\d+)_.*_\d{4}(_\d\d){2}-\d\d(_\d\d){2}")
 """Pattern of the name, without suffix, of a storage file that rosbag2 of ROS 2 Lyrical or newer
@@ -99,40 +101,40 @@ def repair(path: Path, keep_rest: bool = True) -> Repaired:
         BagError: There is no bag, it has no complete message, it is still being recorded, or it
             cannot be written.
     """
-    if path.is_dir():
-        return _repair_folder(path, keep_rest)
-    check_storage_path(path)
-    if (path.parent / FILE_NAME).exists():
-        # metadata.yaml of the folder describes this file, so it must be written again, too.
-        return _repair_folder(path.parent, keep_rest)
-    cut, damaged = _repair_file(path, keep_rest)
-    if not path.exists():
-        raise BagError(f"{path}: no complete message in it; nothing can be read")
-    return Repaired(_summary(path).msgcount, cut, damaged)
+    folder = path
+    paths = [path]
+    if not path.is_dir():
+        check_storage_path(path)
+        folder = path.parent
+    # A file beside metadata.yaml belongs to the bag that this describes, and which is described
+    # again below.
+    is_folder = path.is_dir() or (folder / FILE_NAME).exists()
+    if is_folder:
+        # Files that metadata.yaml describes as complete are repaired, too, because the disk may
+        # have lost their ends after the recording.
+        paths = _find_storage_files(folder)
+    repaired = [_repair_file(one, keep_rest) for one in paths]
 
-
-def _repair_folder(folder: Path, keep_rest: bool) -> Repaired:
-    """Repair all files of a bag and describe them in metadata.yaml; `keep_rest` as in `repair`."""
-    # Files that metadata.yaml describes as complete are checked, too, because the disk may have
-    # lost their ends after the recording.
-    cut = damaged = 0
-    for path in _find_storage_files(folder):
-        cut_here, damaged_here = _repair_file(path, keep_rest)
-        cut += cut_here
-        damaged += damaged_here
-    paths = _find_storage_files(folder)  # files without a complete chunk have been removed
-    existing = {path.suffix for path in paths}
-    storages = [name for name, suffix in SUFFIXES.items() if suffix in existing]
-    if not storages:
+    # Files without a complete chunk have been removed.
+    summaries = []
+    for one in filter(Path.exists, paths):
+        with closing(open_storage(one)) as file:
+            summaries.append(file.summary)
+    if not summaries:
         raise BagError(
-            f"{folder}: no .mcap or .db3 file with a complete message in it; nothing can be read"
+            f"{path}: no .mcap or .db3 file with a complete message in it; nothing can be read"
         )
-    if len(storages) > 1:
-        raise BagError(f"{folder}: .mcap beside .db3 files; move one kind to another folder")
-    summaries = [_summary(path) for path in paths]
-    write_metadata(folder, storages[0], summaries)
-    messages = sum(summary.msgcount for summary in summaries)
-    return Repaired(messages, cut, damaged)
+    if is_folder:
+        suffixes = {Path(summary.name).suffix for summary in summaries}
+        storages = [name for name, suffix in SUFFIXES.items() if suffix in suffixes]
+        if len(storages) > 1:
+            raise BagError(f"{folder}: .mcap beside .db3 files; move one kind to another folder")
+        write_metadata(folder, storages[0], summaries)
+    return Repaired(
+        messages=sum(summary.msgcount for summary in summaries),
+        cut=sum(cut for cut, _ in repaired),
+        damaged=sum(damaged for _, damaged in repaired),
+    )
 
 
 def _find_storage_files(folder: Path) -> list[Path]:
@@ -141,18 +143,13 @@ def _find_storage_files(folder: Path) -> list[Path]:
     Files that metadata.yaml names come first, in its order. The other files, which are all of them
     if there is no readable metadata.yaml, follow by the number in their names.
     """
-    listed: list[str] = []
+    listed: list[Path] = []
     with suppress(BagError):
-        paths, _ = read_metadata(folder)
-        listed = [path.name for path in paths]
-
-    def sort_key(path: Path) -> tuple[int, int, str]:
-        """Return the position in metadata.yaml, the number in the name, and the name of a file."""
-        position = listed.index(path.name) if path.name in listed else len(listed)
-        return position, parse_file_number(path.stem), path.name
-
-    existing = (path for path in folder.iterdir() if path.suffix in SUFFIXES.values())
-    return sorted(existing, key=sort_key)
+        listed, _ = read_metadata(folder)
+    existing = [path for path in folder.iterdir() if path.suffix in SUFFIXES.values()]
+    others = set(existing).difference(listed)
+    by_number = sorted(others, key=lambda path: (parse_file_number(path.stem), path.name))
+    return [path for path in listed if path in existing] + by_number
 
 
 def parse_file_number(stem: str) -> int:
@@ -166,12 +163,6 @@ def parse_file_number(stem: str) -> int:
     dated = _DATED_NAME.fullmatch(stem)
     digits = dated[1] if dated else stem.rpartition("_")[2]
     return int(digits) if digits.isdecimal() else 0
-
-
-def _summary(path: Path) -> FileSummary:
-    """Return the topics, times and numbers of messages of a repaired storage file."""
-    with closing(open_storage(path)) as file:
-        return file.summary
 
 
 def _repair_file(path: Path, keep_rest: bool) -> tuple[int, int]:
@@ -211,7 +202,7 @@ def _repair_mcap(path: Path, keep_rest: bool) -> tuple[int, int]:
     size = path.stat().st_size
     is_complete = _has_summary(path)
     # An intact summary does not prove that the chunks are intact, so all of them are read.
-    salvaged = _SalvagedChunks(path)
+    salvaged = _salvage(path)
     if is_complete and not salvaged.damaged:
         return 0, 0
     if keep_rest and not is_complete and size > salvaged.end:
@@ -228,13 +219,13 @@ def _repair_mcap(path: Path, keep_rest: bool) -> tuple[int, int]:
         # message can be read without it.
         kept = max(len(MCAP_MAGIC), salvaged.end - missing)
         os.truncate(path, kept)
-        salvaged = _SalvagedChunks(path)
+        salvaged = _salvage(path)
     if not salvaged.index.chunk_indexes:
         path.unlink()
     return 0 if is_complete else size - salvaged.end, salvaged.damaged
 
 
-def _write_summary(path: Path, salvaged: _SalvagedChunks) -> int:
+def _write_summary(path: Path, salvaged: _Salvaged) -> int:
     """Replace everything in an MCAP file after its last complete chunk by a new summary.
 
     A chunk is a block of messages; the summary lists topics and offsets of chunks.
@@ -289,12 +280,13 @@ def _has_summary(path: Path) -> bool:
     """Return whether an MCAP file ends with an intact summary (topics and offsets of chunks)."""
     try:
         McapReader(path).close()
-    except READ_ERRORS:
+    except DAMAGE_ERRORS:
         return False
     return True
 
 
-class _SalvagedChunks:
+@dataclass
+class _Salvaged:
     """The complete chunks (blocks of messages) of an MCAP file that was cut off or damaged.
 
     Attributes:
@@ -306,110 +298,12 @@ class _SalvagedChunks:
         damaged: Number of records that were left out because they are damaged.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Read all records of an MCAP file.
+    index: Summary = field(default_factory=Summary)
+    counts: Counter[int] = field(default_factory=Counter)
+    end: int = 0
+    damaged: int = 0
 
-        Raises:
-            BagError: The file does not begin with the bytes of an MCAP file.
-        """
-        self.index = Summary()
-        self.counts: Counter[int] = Counter()
-        self.end = self.damaged = 0
-        self._open_chunk: ChunkIndex | None = None
-        self._open_counts: Counter[int] = Counter()
-        with path.open("rb") as stream:
-            if stream.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
-                raise BagError(f"{path}: does not begin as an MCAP file does; nothing can be read")
-            for opcode, start, content in _records(stream):
-                if opcode == Opcode.HEADER:
-                    self.end = stream.tell()
-                elif opcode in (Opcode.DATA_END, Opcode.FOOTER):
-                    break
-                # A damaged record is left out. The records after it can still be read, because the
-                # length in front of its content states where the next record begins.
-                try:
-                    self._read_record(opcode, start, content)
-                except READ_ERRORS:
-                    self._open_chunk = None
-                    self.damaged += 1
-
-    def _read_record(
-        self,
-        opcode: int,
-        start: int,
-        content: bytes,
-    ) -> None:
-        """Evaluate one record of the file.
-
-        Args:
-            opcode: Type of the record.
-            start: Byte offset of the record from the start of the file.
-            content: The record without its opcode and length.
-
-        Raises:
-            READ_ERRORS: The content of the record is damaged.
-        """
-        if opcode == Opcode.CHUNK:
-            self._begin_chunk(start, content)
-        elif opcode == Opcode.MESSAGE_INDEX and self._open_chunk is not None:
-            self._add_message_index(start, content)
-        else:
-            self._note_definition(opcode, content)
-
-    def _begin_chunk(self, start: int, content: bytes) -> None:
-        """Read a chunk (block of messages) and remember it until its index records have been read.
-
-        Args:
-            start: Byte offset of the chunk record from the start of the file.
-            content: The record without its opcode and length.
-        """
-        self._open_chunk = None
-        chunk: Chunk = _parse(Chunk.read, content)
-        counts: Counter[int] = Counter()
-        for opcode, _, record in _records(BytesIO(unpack_chunk(chunk))):
-            if opcode == Opcode.MESSAGE:
-                counts[int.from_bytes(record[:2], "little")] += 1
-            else:
-                self._note_definition(opcode, record)
-        self._open_counts = counts
-        self._open_chunk = ChunkIndex(
-            chunk_length=RECORD_HEAD.size + len(content),
-            chunk_start_offset=start,
-            compression=chunk.compression,
-            compressed_size=len(chunk.data),
-            message_end_time=chunk.message_end_time,
-            message_index_length=0,
-            message_index_offsets={},
-            message_start_time=chunk.message_start_time,
-            uncompressed_size=chunk.uncompressed_size,
-        )
-
-    def _add_message_index(self, start: int, content: bytes) -> None:
-        """Evaluate an index record, which belongs to one channel (topic) of the chunk before it.
-
-        Args:
-            start: Byte offset of the index record from the start of the file.
-            content: The record without its opcode and length.
-
-        Raises:
-            ValueError: The index has another number of messages than the chunk.
-        """
-        chunk, counts = self._open_chunk, self._open_counts
-        index: MessageIndex = _parse(MessageIndex.read, content)
-        if chunk is None or len(index.records) != counts[index.channel_id]:
-            raise ValueError("an index has another number of messages than its chunk")
-        chunk.message_index_offsets[index.channel_id] = start
-        # Readers need the index records of all channels (topics) of a chunk, so the chunk only
-        # counts as complete when the last of them has been read.
-        if chunk.message_index_offsets.keys() == counts.keys():
-            self.end = start + RECORD_HEAD.size + len(content)
-            chunk_end = chunk.chunk_start_offset + chunk.chunk_length
-            chunk.message_index_length = self.end - chunk_end
-            self.index.chunk_indexes.append(chunk)
-            self.counts += counts
-            self._open_chunk = None
-
-    def _note_definition(self, opcode: int, content: bytes) -> None:
+    def note_definition(self, opcode: int, content: bytes) -> None:
         """Note the message type (schema) or the topic (channel) that a record defines.
 
         Definitions can be repeated in a file; the first one with a given number is kept.
@@ -419,14 +313,76 @@ class _SalvagedChunks:
             content: The record without its opcode and length.
         """
         if opcode == Opcode.SCHEMA:
-            schema: Schema = _parse(Schema.read, content)
+            schema = parse_record(Schema.read, content)
             self.index.schemas.setdefault(schema.id, schema)
         elif opcode == Opcode.CHANNEL:
-            channel: Channel = _parse(Channel.read, content)
+            channel = parse_record(Channel.read, content)
             self.index.channels.setdefault(channel.id, channel)
 
 
-def _encode_summary(salvaged: _SalvagedChunks, name: str) -> bytes:
+def _salvage(path: Path) -> _Salvaged:
+    """Find the complete chunks of an MCAP file.
+
+    Raises:
+        BagError: The file does not begin with the bytes of an MCAP file.
+    """
+    salvaged = _Salvaged()
+    # The last chunk that was read, until the index records of all its channels have been read, and
+    # its number of messages of each channel.
+    chunk: ChunkIndex | None = None
+    counts: Counter[int] = Counter()
+    with path.open("rb") as stream:
+        if stream.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
+            raise BagError(f"{path}: does not begin as an MCAP file does; nothing can be read")
+        for opcode, start, content in _records(stream):
+            end = start + RECORD_HEAD.size + len(content)
+            if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                break
+            # A damaged record is left out. The records after it can still be read, because the
+            # length in front of its content states where the next record begins.
+            try:
+                if opcode == Opcode.HEADER:
+                    salvaged.end = end
+                elif opcode == Opcode.CHUNK:
+                    chunk = None
+                    read, data = read_chunk(content)
+                    counts = Counter()
+                    for kind, _, record in _records(BytesIO(data)):
+                        if kind == Opcode.MESSAGE:
+                            counts[int.from_bytes(record[:2], "little")] += 1
+                        salvaged.note_definition(kind, record)
+                    chunk = ChunkIndex(
+                        chunk_length=end - start,
+                        chunk_start_offset=start,
+                        compression=read.compression,
+                        compressed_size=len(read.data),
+                        message_end_time=read.message_end_time,
+                        message_index_length=0,
+                        message_index_offsets={},
+                        message_start_time=read.message_start_time,
+                        uncompressed_size=read.uncompressed_size,
+                    )
+                elif opcode == Opcode.MESSAGE_INDEX and chunk is not None:
+                    index = parse_record(MessageIndex.read, content)
+                    if len(index.records) != counts[index.channel_id]:
+                        raise McapError("an index has another number of messages than its chunk")
+                    chunk.message_index_offsets[index.channel_id] = start
+                    if chunk.message_index_offsets.keys() == counts.keys():
+                        salvaged.end = end
+                        chunk_end = chunk.chunk_start_offset + chunk.chunk_length
+                        chunk.message_index_length = end - chunk_end
+                        salvaged.index.chunk_indexes.append(chunk)
+                        salvaged.counts += counts
+                        chunk = None
+                else:
+                    salvaged.note_definition(opcode, content)
+            except McapError:
+                chunk = None
+                salvaged.damaged += 1
+    return salvaged
+
+
+def _encode_summary(salvaged: _Salvaged, name: str) -> bytes:
     """Return the records that follow the chunks of a complete MCAP file, up to its end.
 
     Args:
@@ -492,19 +448,6 @@ def _records(stream: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
             return  # the file was cut off within this record, or the record's length is damaged
         yield opcode, start, stream.read(length)
         start += RECORD_HEAD.size + length
-
-
-_Record = TypeVar("_Record", bound=McapRecord)
-
-
-def _parse(read: Callable[[ReadDataStream], _Record], content: bytes) -> _Record:
-    """Parse an MCAP record.
-
-    Args:
-        read: Method `read` of the record's class in the library mcap.
-        content: The record without its opcode and length.
-    """
-    return read(ReadDataStream(BytesIO(content)))
 
 
 def _encode_record(records: Sequence[McapRecord]) -> bytes:

@@ -134,8 +134,8 @@ class SqliteReader:
         if self._list_columns("message_definitions"):
             definitions = dict(
                 self._database.execute(
-                    "SELECT topic_type, encoded_message_definition FROM message_definitions"
-                    " WHERE encoding = 'ros2msg'"
+                    "SELECT topic_type, CAST(encoded_message_definition AS TEXT)"
+                    " FROM message_definitions WHERE encoding = 'ros2msg'"
                 )
             )
         # No table states the number of messages per topic, so they are counted here. This is fast
@@ -145,8 +145,11 @@ class SqliteReader:
                 f"SELECT topic_id, count(*) FROM messages WHERE {_IS_SOUND} GROUP BY topic_id"
             )
         )
-        qos_column = "offered_qos_profiles" if has_qos else "''"
-        topics = self._database.execute(f"SELECT id, name, type, {qos_column} FROM topics")
+        qos_column = "CAST(offered_qos_profiles AS TEXT)" if has_qos else "''"
+        topics = self._database.execute(
+            f"SELECT id, name, type, {qos_column} FROM topics"
+            " WHERE typeof(name) = 'text' AND typeof(type) = 'text'"
+        )
         return {
             number: Connection(
                 topic,

@@ -15,7 +15,7 @@ from ..messages.codec import frequency_codec
 from .read import Bag
 
 if TYPE_CHECKING:
-    from diagnostic_msgs.msg import DiagnosticStatus
+    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
 DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 """Message type of the diagnostics, which state the condition of each node and cube."""
@@ -85,6 +85,7 @@ def last_diagnostics(bag: Bag) -> list[DiagnosticStatus]:
     # Entries come in the order of recording, so a later status replaces an earlier one.
     last = {}
     topics = set(bag.topics(DIAGNOSTICS_TYPE))
+    message: DiagnosticArray
     for _, message in bag.decoded(topics):
         for status in message.status:
             last[status.name] = status

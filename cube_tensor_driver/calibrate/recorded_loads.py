@@ -28,7 +28,9 @@ from .fit import loads_from_forces
 from .load_table import Loads
 
 if TYPE_CHECKING:
-    from geometry_msgs.msg import Vector3
+    from geometry_msgs.msg import Vector3, WrenchStamped
+
+    from ..msg import StressTensorStamped
 
 WRENCH_TYPE = "geometry_msgs/msg/WrenchStamped"
 """ROS message type of a reference sensor that measures the force on the cube."""
@@ -268,7 +270,7 @@ def _read_reference(
         stamp_ns, values = _read_batches(bag, topic, number)
     elif msgtype in (WRENCH_TYPE, TENSOR_TYPE):
         entries = bag.decoded({topic})
-        messages = [message for _, message in entries]
+        messages: list[WrenchStamped | StressTensorStamped] = [message for _, message in entries]
         stamps = [header_stamp_ns(message) for message in messages]
         stamp_ns = np.array(stamps, np.int64)
         if msgtype == WRENCH_TYPE:

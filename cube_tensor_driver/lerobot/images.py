@@ -60,8 +60,8 @@ class ImageStream:
         """
         self._where = f"{bag.path}: {topic}"
         self._shape = shape
-        self._unread = (message for _, message in bag.decoded({topic}))
-        self._next = next(self._unread, None)
+        self._unread = bag.decoded({topic})
+        self._next: RawImage | CompressedImage | None = self._read()
         height, width, bands = shape
         black = Image.new(BAND_MODES[bands - 1], (width, height))
         self._latest = _as_png(black)
@@ -82,7 +82,7 @@ class ImageStream:
             message = None
             while self._next is not None and stamp_ns(self._next) < end_ns:
                 message = self._next
-                self._next = next(self._unread, None)
+                self._next = self._read()
             # Only the last image before the end of the frame is encoded, because encoding is slow.
             if message is not None:
                 self._latest, shape = encode(message, self._where)
@@ -93,6 +93,11 @@ class ImageStream:
                     )
             files.append(self._latest)
         return files
+
+    def _read(self) -> object:
+        """Return the next message; None at the end of the bag."""
+        _, message = next(self._unread, (0, None))
+        return message
 
 
 def encode(message: RawImage | CompressedImage, where: str) -> tuple[bytes, Shape]:

@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -28,6 +28,9 @@ from ..config.skin import Skin
 from ..core.arrays import AnyArray, Index, Times
 from ..core.errors import BagError
 from ..messages.codec import SECOND, frequency_codec
+
+if TYPE_CHECKING:
+    from std_msgs.msg import String
 
 MARK_TYPE = "std_msgs/msg/String"
 """Message type of marks: recorded texts that divide a bag into episodes (executions of a task)."""
@@ -267,6 +270,7 @@ def _read_marks(bag: Bag, topic: str) -> tuple[Times, list[str]]:
             f"{bag.path}: no marks ({MARK_TYPE}) on {topic}; topics of that type: {names}"
         )
     times_ns, tasks = [], [""]
+    mark: String
     for time_ns, mark in bag.decoded({topic}):
         times_ns.append(time_ns)
         tasks.append(mark.data.strip())

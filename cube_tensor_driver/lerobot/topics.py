@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from rosbags.interfaces.typing import Fielddefs
     from sensor_msgs.msg import JointState
 
+    from ..bags.read import StampedMessage
+
 JOINT_STATE_TYPE = "sensor_msgs/msg/JointState"
 """Message type of joint states: names, positions, velocities and efforts of a robot's joints."""
 
@@ -187,6 +189,7 @@ def _is_usable(msgtype: str) -> bool:
 def _read_numbers(bag: Bag, topic: Topic) -> Iterator[tuple[int, dict[str, float]]]:
     """Yield the stamp, in ns, and the numbers by their names of each message on a topic."""
     paths = _number_paths(topic.msgtype)
+    message: StampedMessage
     for _, message in bag.decoded({topic.name}):
         if topic.msgtype == JOINT_STATE_TYPE:
             numbers = _find_joint_numbers(message, f"{bag.path}: {topic.name}")

@@ -169,7 +169,7 @@ class ContactWriter:
             finder.contacts,
             finder.slip,
         )
-        self._writer.write(self._contacts, recorded_ns, serialise(message))
+        self._writer.write(self._contacts, recorded_ns, serialise(CONTACTS, message))
         cloud = finder.cloud(values) if is_due else None
         if cloud is not None:
             message = make_traction_message(
@@ -178,4 +178,4 @@ class ContactWriter:
                 self._frame_id,
                 cloud,
             )
-            self._writer.write(self._traction, recorded_ns, serialise(message))
+            self._writer.write(self._traction, recorded_ns, serialise(TRACTION, message))

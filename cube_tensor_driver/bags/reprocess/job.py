@@ -287,7 +287,7 @@ def _write_skin(
         # within the recording, so that the output has the same start and end.
         inside_ns = min(bag.end_ns, stamp_ns(info))
         inside_ns = max(bag.start_ns, inside_ns)
-        writer.write(f"{skin}info", inside_ns, serialise(info))
+        writer.write(f"{skin}info", inside_ns, serialise(INFO, info))
 
     contacts = None
     if job.contacts is not None:
