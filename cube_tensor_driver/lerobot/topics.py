@@ -25,10 +25,10 @@ from .images import IMAGE_TYPES, LEAVE_OUT, ImageStream, Shape, encode
 from .plan import Choices
 
 if TYPE_CHECKING:
+    from geometry_msgs.msg import WrenchStamped
     from rosbags.interfaces.typing import Fielddefs
     from sensor_msgs.msg import JointState
 
-    from ..bags.read import StampedMessage
 
 JOINT_STATE_TYPE = "sensor_msgs/msg/JointState"
 """Message type of joint states: names, positions, velocities and efforts of a robot's joints."""
@@ -189,8 +189,8 @@ def _is_usable(msgtype: str) -> bool:
 def _read_numbers(bag: Bag, topic: Topic) -> Iterator[tuple[int, dict[str, float]]]:
     """Yield the stamp, in ns, and the numbers by their names of each message on a topic."""
     paths = _number_paths(topic.msgtype)
-    message: StampedMessage
-    for _, message in bag.decoded({topic.name}):
+    messages: Iterator[tuple[int, JointState | WrenchStamped]] = bag.decoded({topic.name})
+    for _, message in messages:
         if topic.msgtype == JOINT_STATE_TYPE:
             numbers = _find_joint_numbers(message, f"{bag.path}: {topic.name}")
         else:
