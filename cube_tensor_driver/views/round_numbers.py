@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-import numpy as np
+import math
 
 NOISE_SHARE = 0.02
 """Fraction of the largest absolute value in a chart up to which values are considered as noise.
@@ -13,13 +13,16 @@ If the values on one side of zero are all noise, the axis ends at zero on that s
 """
 
 
+ROUNDING_ERROR = 1e-9
+"""Relative tolerance, so that a length of exactly 1, 2 or 5 does not become the next number."""
+
+
 def round_down(length: float) -> float:
     """Return the largest number of the form 1, 2 or 5 times a power of ten that is at most
     `length`, which must be positive."""
-    # The tolerance keeps a rounding error from turning a length of exactly 1, 2 or 5 into the next
-    # smaller number.
-    limit = length * (1 + 1e-9)
-    return max(number for number in _round_numbers(length) if number <= limit)
+    limit = length * (1 + ROUNDING_ERROR)
+    fitting = [number for number in _round_numbers(length) if number <= limit]
+    return max(fitting)
 
 
 def round_range(low: float, high: float) -> tuple[float, float]:
@@ -30,22 +33,25 @@ def round_range(low: float, high: float) -> tuple[float, float]:
     of the largest one ends at zero.
     """
     size = max(-low, high, 1e-9)
+    min_step = size * (1 - ROUNDING_ERROR)
+    fitting = [number for number in _round_numbers(size) if number >= min_step]
+    step = min(fitting) / 2
     # One noisy value below zero would add a whole step of empty space below positive values.
     noise = NOISE_SHARE * size
-    if abs(low) <= noise:
-        low = 0.0
-    if abs(high) <= noise:
-        high = 0.0
-    # The tolerance keeps a rounding error from giving a size of exactly 1, 2 or 5 the next larger
-    # step.
-    min_step = size * (1 - 1e-9)
-    step = min(number for number in _round_numbers(size) if number >= min_step) / 2
-    n_below = np.floor(min(low, 0) / step)
-    n_above = np.ceil(max(high, 0) / step)
-    return float(n_below * step), float(n_above * step)
+    n_below = n_above = 0
+    if low < -noise:
+        n_below = math.floor(low / step)
+    if high > noise:
+        n_above = math.ceil(high / step)
+    return n_below * step, n_above * step
 
 
 def _round_numbers(size: float) -> list[float]:
     """Return 1, 2, 5 and 10 times the largest power of ten that is at most `size`."""
-    power = float(10.0 ** np.floor(np.log10(size)))
-    return [power, 2 * power, 5 * power, 10 * power]
+    power = 10.0 ** math.floor(math.log10(size))
+    return [
+        power,
+        2 * power,
+        5 * power,
+        10 * power,
+    ]

@@ -12,7 +12,7 @@ import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -21,7 +21,10 @@ from matplotlib.figure import Figure
 from ...config.output_files import write_atomically
 from ...core.errors import ConfigError
 
-SETTINGS: Any = {
+if TYPE_CHECKING:
+    from matplotlib.typing import RcKeyType
+
+SETTINGS: dict[RcKeyType, object] = {
     "font.size": 9,
     "axes.grid": True,
     "grid.color": "0.85",
