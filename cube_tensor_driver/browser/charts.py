@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import product
 from typing import NamedTuple
 
@@ -108,7 +108,12 @@ class Chart(NamedTuple):
 
 
 class Charts:
-    """The tab with plots over time, of the chosen cube and of cubes named in a text field."""
+    """The tab with plots over time, of the chosen cube and of cubes named in a text field.
+
+    Attributes:
+        lists: Drop-down list of what each chart shows.
+        plots: The charts themselves.
+    """
 
     def __init__(
         self,
@@ -123,35 +128,32 @@ class Charts:
             tab: The tab of the panel.
             names: Names of the cubes of the skin.
         """
-        self._gui, self._tab, self._names = gui, tab, list(names)
+        self._names = list(names)
         self._history: History | None = None
         self._cubes = [0]
         self._charts = [Chart("", 1.0, {})] * len(FIRST_GROUPS)
+        self.lists: list[viser.GuiDropdownHandle[str]] = []
+        self.plots: list[viser.GuiUplotHandle] = []
         with tab:
             self._text = gui.add_text(
                 "more cubes",
                 "",
                 hint="names, for example: c05 c06. The chosen cube comes first.",
-                order=0,
             )
-            # Each chart takes two positions (`order`) in the tab: its drop-down list and its plot.
-            self.lists = [
-                gui.add_dropdown(
-                    "plot",
-                    tuple(GROUPS),
-                    initial_value=group,
-                    order=1 + 2 * number,
+            for group in FIRST_GROUPS:
+                self.lists.append(gui.add_dropdown("plot", tuple(GROUPS), initial_value=group))
+                plot = gui.add_uplot(
+                    (np.zeros(1), np.full(1, np.nan)),
+                    _make_series([""]),
+                    height=CHART_HEIGHT,
+                    padding=(10, 12, 0, 0),
+                    # Plots with the same key share one cursor: both show the values of one instant.
+                    cursor={"sync": {"key": "skin"}},
                 )
-                for number, group in enumerate(FIRST_GROUPS)
-            ]
-            files = gui.add_button_group(
-                "save as",
-                ("CSV", "PNG"),
-                order=10,
-            )
+                self.plots.append(plot)
+            files = gui.add_button_group("save as", ("CSV", "PNG"))
             zoom = "To zoom, pause the page and drag. A double click shows all again."
-            gui.add_html(markup.box(zoom), order=11)
-        self._plots: list[viser.GuiUplotHandle | None] = [None] * len(FIRST_GROUPS)
+            gui.add_html(markup.box(zoom))
 
         @files.on_click
         def _(event: viser.GuiEvent[viser.GuiButtonGroupHandle]) -> None:
@@ -165,9 +167,8 @@ class Charts:
             chosen: Index of the cube that the user chose on the page.
         """
         self._history = history
-        indices = {name: number for number, name in enumerate(self._names)}
         words = str(self._text.value).replace(",", " ").split()
-        named = [indices[word] for word in words if word in indices]
+        named = [self._names.index(word) for word in words if word in self._names]
         # `dict.fromkeys` removes repeated cubes and keeps the order: the chosen cube is the first.
         self._cubes = list(dict.fromkeys([chosen, *named]))
         for number, one in enumerate(self.lists):
@@ -184,84 +185,20 @@ class Charts:
                 self._charts[number] = chart
         return tuple(self._charts)
 
-    def replace_plots(self, charts: Sequence[Chart]) -> dict[str, viser.GuiUplotHandle]:
-        """Replace the plots whose lines have changed, as uPlot cannot add a line to a plot.
-
-        Args:
-            charts: What the charts show.
-
-        Returns:
-            Name of each new plot -> the plot.
-        """
-        new: dict[str, viser.GuiUplotHandle] = {}
-        for number, chart in enumerate(charts):
-            plot = self._plots[number]
-            # A plot is made only when its chart has lines; until then both lists are empty.
-            series = plot.series[1:] if plot is not None else ()
-            plotted = [one["label"] for one in series]
-            if plotted == list(chart.lines):
-                continue
-            if plot is not None:
-                plot.remove()
-            plot = self._add_plot(chart, 2 + 2 * number)
-            self._plots[number] = plot
-            new[f"chart {number}"] = plot
-        return new
-
-    def _add_plot(self, chart: Chart, order: float) -> viser.GuiUplotHandle:
-        grid: uplot.Axis_Grid = {"stroke": "#dee2e6", "width": 1}
-        labels = (TIME_LABEL, chart.axis)
-        axes = tuple(
-            uplot.Axis(
-                stroke="#343a40",
-                grid=grid,
-                size=size,
-                label=label,
-                labelSize=18,
-            )
-            for size, label in zip(AXIS_SIZES, labels, strict=True)
-        )
-        series = [
-            uplot.Series(
-                label=label,
-                stroke=COLOURS[number % len(COLOURS)],
-                width=1.8,
-                dash=DASHES[number // len(COLOURS) % len(DASHES)],
-            )
-            for number, label in enumerate(chart.lines)
-        ]
-        with self._tab:
-            return self._gui.add_uplot(
-                (np.array([0.0]),) * (1 + len(series)),
-                (uplot.Series(label="s"), *series),
-                height=CHART_HEIGHT,
-                axes=axes,
-                scales=_make_scales(0.0, 1.0),
-                padding=(10, 12, 0, 0),
-                # Plots with the same key share one cursor: both show the values of one instant.
-                cursor={"sync": {"key": "skin"}},
-                order=order,
-            )
-
     def _save(self, client: viser.ClientHandle | None, kind: str) -> None:
         history = self._history
         if client is None or history is None:
             return
-        if kind == "CSV":
-            content = format_csv(history, self._cubes, self._names)
-            client.send_file_download(
-                "skin.csv",
-                content,
-                save_immediately=True,
-            )
-        elif kind == "PNG":
+        if kind == "PNG":
             panels = [(chart.axis, chart.values(history)) for chart in self._charts]
-            figure = draw_panels(history.times, TIME_LABEL, panels)
-            client.send_file_download(
-                "skin.png",
-                png(figure),
-                save_immediately=True,
-            )
+            content = png(draw_panels(history.times, TIME_LABEL, panels))
+        else:
+            content = format_csv(history, self._cubes, self._names)
+        client.send_file_download(
+            f"skin.{kind.lower()}",
+            content,
+            save_immediately=True,
+        )
 
 
 def make_chart(
@@ -291,29 +228,51 @@ def make_chart(
 
 
 def make_chart_properties(history: History, chart: Chart) -> dict[str, object]:
-    """Return the data and the axis ranges of a plot as properties of viser; {} without lines.
+    """Return the lines, data and axes of a plot as properties of viser; {} without lines.
 
     Args:
         history: Values of all cubes in the last seconds.
         chart: What the plot shows.
     """
-    values = list(chart.values(history).values())
+    values = chart.values(history)
     if not values:
         return {}
     # The range is computed here, because uPlot cannot compute it from values with NaN.
-    finite = np.concatenate(values)
+    finite = np.concatenate(list(values.values()))
     finite = finite[np.isfinite(finite)]
-    lowest = finite.min(initial=0.0)
-    highest = finite.max(initial=0.0)
-    low, high = round_range(lowest, highest)
+    low, high = round_range(finite.min(initial=0.0), finite.max(initial=0.0))
     if history.count // RELAYOUT_PERIOD % 2:
         high += 1e-9 * (high - low)
-    return {"data": (history.times, *values), "scales": _make_scales(low, high)}
+    axes = tuple(
+        uplot.Axis(
+            stroke="#343a40",
+            grid={"stroke": "#dee2e6", "width": 1},
+            size=size,
+            label=label,
+            labelSize=18,
+        )
+        for size, label in zip(AXIS_SIZES, (TIME_LABEL, chart.axis), strict=True)
+    )
+    return {
+        "series": _make_series(values),
+        "data": (history.times, *values.values()),
+        "axes": axes,
+        "scales": {"x": TIME_SCALE, "y": uplot.Scale(auto=False, range=(low, high))},
+    }
 
 
-def _make_scales(low: float, high: float) -> dict[str, uplot.Scale]:
-    value_scale = uplot.Scale(auto=False, range=(low, high))
-    return {"x": TIME_SCALE, "y": value_scale}
+def _make_series(labels: Iterable[str]) -> tuple[uplot.Series, ...]:
+    """Return the appearance of the time, which comes first, and of the line with each label."""
+    lines = (
+        uplot.Series(
+            label=label,
+            stroke=COLOURS[number % len(COLOURS)],
+            width=1.8,
+            dash=DASHES[number // len(COLOURS) % len(DASHES)],
+        )
+        for number, label in enumerate(labels)
+    )
+    return uplot.Series(label="s"), *lines
 
 
 def format_csv(
@@ -331,23 +290,21 @@ def format_csv(
     Returns:
         The content of the file. Components that no cube observes have no column.
     """
-    observed = history.observed_names
-    header = "time / s"
+    header = ["time / s"]
     columns = [history.times]
     for cube in cubes:
         for column, name in enumerate(History.COLUMNS):
-            if name not in observed:
-                continue
-            unit = "1" if name == "residual" else "Pa/m" if "_" in name else "Pa"
-            header += f",{names[cube]} {name} / {unit}"
-            columns.append(history.of(cube, column))
+            if name in history.observed_names:
+                unit = "1" if name == "residual" else "Pa/m" if "_" in name else "Pa"
+                header.append(f"{names[cube]} {name} / {unit}")
+                columns.append(history.of(cube, column))
     content = io.BytesIO()
     np.savetxt(
         content,
         np.column_stack(columns),
         fmt="%.6g",
         delimiter=",",
-        header=header,
+        header=",".join(header),
         comments="",
     )
     return content.getvalue()

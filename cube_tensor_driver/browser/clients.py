@@ -24,7 +24,8 @@ from .markup import NoteColour
 from .page import JUMP
 
 Say = Callable[[str, str, NoteColour], None]
-"""Function that shows a note to the user: it takes the note's title, text and colour."""
+"""Function that shows a note to the user: its arguments are the result of an action in a few words,
+further text about it, and the colour of the note."""
 
 MAX_ANSWER_S = 10.0
 """Maximum time, in seconds, from the call of a service to its answer.
@@ -69,8 +70,7 @@ class ServiceCalls:
             notes_success: Whether a note is shown if the service did what was requested.
         """
         if not client.service_is_ready():
-            text = f"{what}: no node that can do it is running"
-            self._say(f"{what} is not possible", text, "red")
+            self._say(f"{what} not possible", "no node that can do it is running", "red")
             return
         future = client.call_async(request)
         self._open.append(_Call(what, future, time.monotonic(), notes_success))
@@ -88,26 +88,17 @@ class ServiceCalls:
         for call in self._open:
             if call.future.done():
                 answer = call.future.result()
-                if call.notes_success or not answer.success:
-                    self._report(call.what, answer)
+                if not answer.success:
+                    text = f"nothing was changed: {answer.message}"
+                    self._say(f"{call.what} refused", text, "red")
+                elif call.notes_success:
+                    self._say(f"{call.what} done", answer.message, "green")
             elif time.monotonic() - call.asked_s > MAX_ANSWER_S:
-                text = f"{call.what}: no answer within {MAX_ANSWER_S:g} s"
-                self._say(f"{call.what} had no answer", text, "red")
+                self._say(f"{call.what} failed", f"no answer within {MAX_ANSWER_S:g} s", "red")
                 call.future.cancel()
             else:
                 still_open.append(call)
         self._open = still_open
-
-    def _report(self, what: str, answer: Any) -> None:
-        if answer.success:
-            self._say(
-                f"{what} is done",
-                f"{what} done: {answer.message}",
-                "green",
-            )
-        else:
-            text = f"{what} refused, nothing was changed: {answer.message}"
-            self._say(f"{what} was refused", text, "red")
 
 
 class ReplayClient:
@@ -189,11 +180,7 @@ class ReplayClient:
         if self.state is None or not self._client.service_is_ready():
             if time.monotonic() > self._wanted_s + MAX_ANSWER_S:
                 self._wanted_position = None
-                self._say(
-                    "No jump is possible",
-                    "jump: no replay is running",
-                    "red",
-                )
+                self._say("jump not possible", "no replay is running", "red")
             return False
 
         # The slider may still have the length of the bag that was replayed before this one.
@@ -247,13 +234,13 @@ class BagRecorder:
         """
         if self._process is not None:
             self.end()
-            self._say("Recorded", f"recorded to {self.path}", "green")
+            self._say("recorded", f"{self.path}", "green")
             return
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             text = f"{self._folder}: {error.strerror}; name another folder with --recordings"
-            self._say("The recording did not start", text, "red")
+            self._say("recording not possible", text, "red")
             return
         self.path = self._folder / time.strftime("skin_%Y%m%d_%H%M%S")
         record = ["-m", "cube_tensor_driver.cli", "record", "-o", str(self.path)]
@@ -265,7 +252,7 @@ class BagRecorder:
             # the recorder does not get it and can finish its file when `end` asks for that.
             start_new_session=True,
         )
-        self._say("Recording", f"recording to {self.path}", "blue")
+        self._say("recording", f"{self.path}", "blue")
 
     def end(self) -> None:
         """Ask the recorder to finish its bag, and wait up to `MAX_END_S` for it.
@@ -286,7 +273,7 @@ class BagRecorder:
     def is_recording(self) -> bool:
         """Return whether a bag is being recorded; show a note if the recorder ended by itself."""
         if self._process is not None and self._process.poll() is not None:
-            text = f"recording ended by itself with code {self._process.returncode}"
-            self._say("The recording ended", text, "red")
+            text = f"the recorder ended by itself with code {self._process.returncode}"
+            self._say("recording failed", text, "red")
             self._process = None
         return self._process is not None

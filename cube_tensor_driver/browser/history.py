@@ -131,14 +131,12 @@ class SampleRate:
         # Numbers of samples continue at 0 after 2**32 - 1. The difference of two uint32 is right in
         # that case, too.
         samples = rows.sequence - self._first_sequence[cube]
-        is_earlier = elapsed_s < 0
-        was_silent = elapsed_s > MAX_RATE_PERIOD_S
-        has_restarted = samples > MAX_NUMBER_DIFFERENCE
-        is_new = is_earlier | was_silent | has_restarted
-        is_over = ~is_new & (elapsed_s > RATE_PERIOD_S)
+        # A difference is implausible if the clock was set, or the cube was silent or restarted.
+        is_plausible = (
+            (elapsed_s >= 0) & (elapsed_s < MAX_RATE_PERIOD_S) & (samples <= MAX_NUMBER_DIFFERENCE)
+        )
+        is_over = is_plausible & (elapsed_s > RATE_PERIOD_S)
         self.hertz[cube[is_over]] = samples[is_over] / elapsed_s[is_over]
-
-        is_first = is_new | is_over
-        begins = cube[is_first]
-        self._first_ns[begins] = rows.stamp_ns[is_first]
-        self._first_sequence[begins] = rows.sequence[is_first]
+        begins = is_over | ~is_plausible
+        self._first_ns[cube[begins]] = rows.stamp_ns[begins]
+        self._first_sequence[cube[begins]] = rows.sequence[begins]

@@ -87,31 +87,36 @@ class PageStatus:
     """What the page shows besides measured values: recording, and the result of the last action.
 
     Attributes:
-        action: Text about the result of the user's last action, such as a tare.
-        title: Title of the note that shows the text `action`.
-        colour: Colour of that note.
+        title: Result of the user's last action in a few words, such as "tare done"; empty before.
+        detail: Further text about this result.
+        colour: Colour of the note that shows both.
         recording: Whether a bag is being recorded.
     """
 
-    action: str = ""
     title: str = ""
+    detail: str = ""
     colour: NoteColour = "blue"
     recording: bool = False
+
+    @property
+    def action(self) -> str:
+        """Title and detail as one line."""
+        return f"{self.title}: {self.detail}" if self.title else ""
 
     def say(
         self,
         title: str,
-        action: str,
-        colour: NoteColour = "blue",
+        detail: str,
+        colour: NoteColour,
     ) -> None:
         """Store the result of an action, which the page shows as a line and as a note.
 
         Args:
-            title: Title of the note.
-            action: Text of the line and of the note.
+            title: The result in a few words.
+            detail: Further text about it.
             colour: Colour of the note.
         """
-        self.title, self.action, self.colour = title, action, colour
+        self.title, self.detail, self.colour = title, detail, colour
 
 
 def waiting(domain: str) -> str:

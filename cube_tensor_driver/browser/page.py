@@ -150,7 +150,7 @@ class Page:
     ) -> None:
         self._client, self._layout, self._skin = client, layout, skin
         self._scan: Scan | None = None
-        self._history: History | None = None
+        self._frozen: tuple[Scan, History] | None = None
         self._paused = False
         self._ranges = self._ranges_before = Ranges()
         self._quantity: Quantity | None = None
@@ -177,42 +177,38 @@ class Page:
             history: Values of all cubes in the last seconds; the newest are those of the scan.
             status: Recording, and result of the user's last action.
         """
-        is_frozen = self._history is not None
-        if not self._paused or not is_frozen:
-            shown = self._scan
-            # While no new values arrive, as in a replay that is held, the automatic ranges of
-            # colours and arrows do not change.
-            if shown is None or not np.array_equal(shown.values, scan.values, equal_nan=True):
-                self._ranges_before = self._ranges
-            self._scan = scan
-            # A paused page keeps the first scan that it gets after the pause began. Its history is
-            # copied, because the pages of other browsers still add to the common one.
-            self._history = copy.deepcopy(history) if self._paused else None
+        # A paused page keeps the first scan that it gets after the pause began. Its history is
+        # copied, because the pages of other browsers still add to the common one.
+        if not self._paused:
+            self._frozen = None
+        elif self._frozen is None:
+            self._frozen = scan, copy.deepcopy(history)
+        scan, history = self._frozen or (scan, history)
+        # While no new values arrive, as in a replay that is held, the automatic ranges of colours
+        # and arrows do not change.
+        shown = self._scan
+        if shown is None or not np.array_equal(shown.values, scan.values, equal_nan=True):
+            self._ranges_before = self._ranges
+        self._scan = scan
         self._show_status(status)
-        shown_history = self._history or history
-        settings = self._read_settings(shown_history, status)
         update, self._ranges = build_update(
             self._skin,
-            self._scan or scan,
-            shown_history,
-            settings,
+            scan,
+            history,
+            self._read_settings(history, status),
             self._ranges_before,
         )
-        self.send(update, settings)
+        self.send(update)
 
-    def send(self, update: Update, settings: ViewSettings) -> None:
+    def send(self, update: Update) -> None:
         """Send the changed properties of all objects to the browser, as one update.
 
         Args:
             update: Name of an object on the page -> its properties.
-            settings: What the user has chosen to see.
         """
         # `atomic` makes the browser apply all changes at once. Otherwise it could show numbers of
         # one instant beside the picture of another one.
         with self._client.atomic():
-            for name, plot in self._charts.replace_plots(settings.charts).items():
-                self._objects[name] = plot
-                self._sent = {key: value for key, value in self._sent.items() if key[0] != name}
             for name, properties in update.items():
                 for key, value in properties.items():
                     # viser sends most assignments to the browser, even if the value is the same.
@@ -248,7 +244,7 @@ class Page:
             self._action.content = markup.box(escape(status.action))
             self._client.add_notification(
                 status.title,
-                status.action,
+                status.detail,
                 auto_close_seconds=NOTE_S,
                 color=status.colour,
             )
@@ -310,8 +306,10 @@ class Page:
         panel = gui.add_panel()
         plots = panel.add_tab("plots of 10 s", viser.Icon.CHART_LINE)
         self._charts = Charts(gui, plots, self._skin.names)
-        for number, one in enumerate(self._charts.lists):
-            self._objects[f"chart list {number}"] = one
+        for number, (one, plot) in enumerate(
+            zip(self._charts.lists, self._charts.plots, strict=True)
+        ):
+            self._objects |= {f"chart list {number}": one, f"chart {number}": plot}
         panel.dock_left()
         panel.set_width(LEFT_WIDTH)
         if self._layout.is_folded:

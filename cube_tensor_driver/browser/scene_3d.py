@@ -310,10 +310,12 @@ class Scene:
         update["names"] = {"visible": "names" in parts}
         lines = dict.fromkeys(LINES, NO_LINES)
         traction, gradient = self._find_arrow_lengths(ranges)
-        if "traction" in parts:
-            lines["traction"] = self._draw_arrows(scene.make_traction_arrows, scan.values, traction)
-        if "gradient" in parts:
-            lines["gradient"] = self._draw_arrows(scene.make_gradient_arrows, scan.values, gradient)
+        arrows = {
+            "traction": (scene.make_traction_arrows, traction),
+            "gradient": (scene.make_gradient_arrows, gradient),
+        }
+        for name in parts & arrows.keys():
+            lines[name] = self._draw_arrows(*arrows[name], scan.values)
         if "principal" in parts:
             lines |= self._draw_crosses(scan.values, ranges.traction)
         crosses = scene.make_fault_crosses(self._placement.poses, scan.health)
@@ -380,16 +382,16 @@ class Scene:
     def _draw_arrows(
         self,
         lines: ArrowLines,
-        values: Array,
         length: float,
+        values: Array,
     ) -> Array:
         """Return the lines of an arrow on the upper face of each cube.
 
         Args:
             lines: Function that returns tails and tips of the arrows.
+            length: Length of the arrows, in units of the scene per SI unit of the values.
             values: (N, 15) 6 stress components in Pa and 9 gradients in Pa/m, in the frames of the
                 cubes.
-            length: Length of the arrows, in units of the scene per SI unit of the values.
         """
         poses = self._placement.poses
         arrows = lines(poses, values, length)

@@ -197,8 +197,9 @@ class Source:
         of = self.stamp_ns[number], "skin_base"
         ones = np.ones(N)
         cloud = np.column_stack([self._points, STEP_PA * number * ones, 0 * ones, ones])
-        self._traction.publish(make_traction_message(make_message, *of, cloud))
+        # The page names the node as the source of the field only once both have come.
         self._contacts.publish(make_contacts_message(make_message, *of, [contact]))
+        self._traction.publish(make_traction_message(make_message, *of, cloud))
 
 
 @pytest.fixture
@@ -276,7 +277,7 @@ def test_automatic_ranges_fall_only_with_new_values(monkeypatch):
 
     monkeypatch.setattr(page_module, "build_update", build)
     ranges = scene.Ranges()
-    shown = SimpleNamespace(_scan=None, _history=None, _paused=False, _skin=None, _ranges=ranges)
+    shown = SimpleNamespace(_scan=None, _frozen=None, _paused=False, _skin=None, _ranges=ranges)
     shown.send = shown._read_settings = shown._show_status = ignore
     tops = []
     for pressure in (TOP_PA, 0.0, 0.0, 0.0, 1.0):

@@ -108,7 +108,7 @@ def client(ros):
     said: list[str] = []
 
     def say(title: str, text: str, colour: str) -> None:
-        said.append(text)
+        said.append(f"{title}: {text}")
 
     replay = ReplayClient(ros.node, ServiceCalls(say), say)
     states = ros.node.create_publisher(ReplayState, "player/state", 1)
@@ -166,7 +166,7 @@ def test_a_jump_of_no_replay_is_said(ros, client, clock):
     assert not client.replay.update() and client.said == []
     clock.late += MAX_ANSWER_S + 0.1
     assert not client.replay.update()
-    assert client.said == ["jump: no replay is running"]
+    assert client.said == ["jump not possible: no replay is running"]
     ros.wait(client.is_running)
     assert not client.replay.is_jumping
 
@@ -181,5 +181,5 @@ def test_a_jump_without_an_answer_is_said_and_the_next_one_is_asked_for(ros, cli
     # Nothing is spun: the answer does not come.
     clock.late += MAX_ANSWER_S + 0.1
     assert client.replay.update()
-    assert client.said == ["jump: no answer within 10 s"]
+    assert client.said == ["jump failed: no answer within 10 s"]
     ros.wait(lambda: asked == [0.0, 1.0])
