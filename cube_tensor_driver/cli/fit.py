@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 from .parser import Parser, positive, uid
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from ..calibrate.fit import Fit
     from ..calibrate.load_table import Loads
     from ..core.arrays import Array
@@ -97,18 +99,51 @@ def add_arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Calibrate from a table of known loads and measured frequencies."""
+    """Calibrate from a table of known loads and measured frequencies, or from bags."""
+    if options.weight is not None:
+        run_weight(options)
+    elif options.creep is not None:
+        run_creep(options)
+    elif options.rest is not None:
+        run_rest(options)
+    else:
+        run_table(options)
+    return 0
+
+
+def publish(
+    options: argparse.Namespace,
+    calibration: Calibration,
+    picture: Figure,
+    words: str,
+    suffix: str = "",
+) -> None:
+    """Write the picture and the calibration file of a fit, and print the path of the file.
+
+    Args:
+        options: The options of the command, with the paths of both files.
+        calibration: The result of the fit.
+        picture: The picture.
+        words: The words behind ./cube fit, which the header of the file states.
+        suffix: Text that is added to the names of both files.
+    """
+    from ..config.calibration import write_calibration
+    from ..views.figures.style import save
+
+    path, figure = (
+        one.with_stem(f"{one.stem}{suffix}") for one in (options.output, options.figure)
+    )
+    save(picture, figure)
+    write_calibration(path, calibration, f"./cube fit {words}")
+    print(f"wrote {path}: calibration {calibration.id}")
+
+
+def run_table(options: argparse.Namespace) -> None:
+    """Fit the response to a table of loads or to a bag with a reference sensor."""
     import datetime
     from dataclasses import replace
 
     import numpy as np
-
-    if options.weight is not None:
-        return run_weight(options)
-    if options.creep is not None:
-        return run_creep(options)
-    if options.rest is not None:
-        return run_rest(options)
 
     from ..calibrate.fit import fit, measured_stress
     from ..config.calibration import find_named_layout
@@ -116,7 +151,6 @@ def run(options: argparse.Namespace) -> int:
     from ..core.errors import ConfigError
     from ..core.symmetry import find_structure
     from ..views.figures.calibration import draw_fit
-    from ..views.figures.style import save
 
     if options.loads is None or options.layout is None:
         raise ConfigError(
@@ -146,35 +180,18 @@ def run(options: argparse.Namespace) -> int:
         figures = {name: getattr(result, name) for name in FIGURES}
         # Each outlier is a pair: index of the row among the rows with load, index of the pad.
         write_json(options.json, figures | {"outliers": np.argwhere(result.outliers)})
-    save(draw_fit(result, measured), options.figure)
     # The calibration file contains time and source, so that its origin can be found later.
     created = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
     table = options.loads.name
     calibration = result.calibration(base, created, f"fit of {table}, {len(measured)} loads")
     words = f"{table} --layout {options.layout} --symmetry {options.symmetry}"
-    write_result(options.output, calibration, words)
-    return 0
+    publish(options, calibration, draw_fit(result, measured), words)
 
 
-def write_result(path: Path, calibration: Calibration, words: str) -> None:
-    """Write a calibration file and print its path.
-
-    Args:
-        path: The file.
-        calibration: The result of a fit.
-        words: The words behind ./cube fit, which the header of the file states.
-    """
-    from ..config.calibration import write_calibration
-
-    write_calibration(path, calibration, f"./cube fit {words}")
-    print(f"wrote {path}: calibration {calibration.id}")
-
-
-def run_rest(options: argparse.Namespace) -> int:
+def run_rest(options: argparse.Namespace) -> None:
     """Fit the effect of temperature to bags, print and draw it, and write the calibrations."""
     from ..calibrate.thermal import fit_thermal, read_warming
     from ..views.figures.calibration import draw_thermal_fit
-    from ..views.figures.style import save
     from ..views.terminal.output import print_table
 
     warming = read_warming(options.rest, options.cube)
@@ -188,87 +205,66 @@ def run_rest(options: argparse.Namespace) -> int:
         rows.append((name, lags, degree, *(f"{size:.2f}" for size in result.sizes())))
     print_table(("cube",), columns, rows)
     for name, result in fits.items():
-        path, picture = options.output, options.figure
-        if len(fits) > 1:
-            path, picture = (one.with_stem(f"{one.stem}_{name}") for one in (path, picture))
-        base = warming[name][0]
+        base, _ = warming[name]
         calibration = result.calibration(base, f"{base.source}; temperature fitted to {bags}")
-        save(draw_thermal_fit(result), picture)
-        write_result(path, calibration, f"--rest {bags}")
-    return 0
+        suffix = f"_{name}" if len(fits) > 1 else ""
+        publish(
+            options,
+            calibration,
+            draw_thermal_fit(result),
+            f"--rest {bags}",
+            suffix,
+        )
 
 
-def run_weight(options: argparse.Namespace) -> int:
+def run_weight(options: argparse.Namespace) -> None:
     """Fit the response to weight and inertia to a bag, print it and write the calibration."""
     from ..calibrate.weight import fit_weight
     from ..views.figures.calibration import draw_correction
-    from ..views.figures.style import save
     from ..views.terminal.output import print_table
 
     calibration, *shown = fit_weight(options.weight, options.cube)
     model = calibration.weight
     if model is not None and model.deviation is not None:
-        rows = []
-        for pad, values, deviations in zip(
-            calibration.layout.pads,
-            model.response,
-            model.deviation,
-            strict=True,
-        ):
-            pairs = zip(values, deviations, strict=True)
-            rows.append((pad, *(f"{value:+.3f} ± {sd:.2g}" for value, sd in pairs)))
-        print_table(
-            ("pad",),
-            [f"{axis}, Pa per m/s²" for axis in "xyz"],
-            rows,
-        )
+        cells = [
+            [f"{value:+.3f} ± {sd:.2g}" for value, sd in zip(*of_pad, strict=True)]
+            for of_pad in zip(model.response, model.deviation, strict=True)
+        ]
+        pads = calibration.layout.pads
+        rows = [(pad, *values) for pad, values in zip(pads, cells, strict=True)]
+        print_table(("pad",), [f"{axis}, Pa per m/s²" for axis in "xyz"], rows)
     title = f"stress of the {len(calibration.gain)} pads under weight alone"
-    save(draw_correction(title, *shown), options.figure)
-    write_result(options.output, calibration, f"--weight {options.weight.name}")
-    return 0
+    picture = draw_correction(title, *shown)
+    publish(options, calibration, picture, f"--weight {options.weight.name}")
 
 
-def run_creep(options: argparse.Namespace) -> int:
+def run_creep(options: argparse.Namespace) -> None:
     """Fit the creep of the foam to a bag with one press, print it and write the calibration."""
     from ..calibrate.creep import compute_step_reading, fit_recorded_creep
     from ..views.figures.calibration import draw_correction
-    from ..views.figures.style import save
     from ..views.terminal.output import print_table, say
 
     result, calibration = fit_recorded_creep(options.creep, options.cube)
-    rows = []
-    times_s = (1.0, 600.0, 3600.0)
-    at_once, *later = (compute_step_reading(result.model, time_s) for time_s in times_s)
-    for pad, load, *readings in zip(
-        calibration.layout.pads,
-        result.load,
-        at_once,
-        *later,
-        strict=True,
-    ):
-        growth = [f"{100 * (reading / readings[0] - 1):.2f}" for reading in readings[1:]]
-        rows.append((pad, f"{load:.0f}", *growth))
+    at_once, *later = (compute_step_reading(result.model, time) for time in (1.0, 600.0, 3600.0))
+    growth = [[f"{percent:.2f}" for percent in 100 * (one / at_once - 1)] for one in later]
+    loads = [f"{load:.0f}" for load in result.load]
     print_table(
         ("pad",),
         ("load, Pa", "creep from 1 s to 10 min, %", "to 1 h, %"),
-        rows,
+        list(zip(calibration.layout.pads, loads, *growth, strict=True)),
     )
     say(
         f"{len(result.model.time)} relaxation times explain a hold of {result.hold_s:.0f} s to "
         f"{100 * result.misfit:.2g} % of the load"
     )
     title = f"change of the {len(result.load)} pads' readings under a constant load, and after it"
-    save(
-        draw_correction(
-            title,
-            result.seconds,
-            result.before,
-            result.after,
-        ),
-        options.figure,
+    picture = draw_correction(
+        title,
+        result.seconds,
+        result.before,
+        result.after,
     )
-    write_result(options.output, calibration, f"--creep {options.creep.name}")
-    return 0
+    publish(options, calibration, picture, f"--creep {options.creep.name}")
 
 
 def read_inputs(

@@ -259,7 +259,8 @@ def test_the_duration_of_a_recording_begins_with_its_first_message(tmp_path, mon
     for module in (record, session):
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now[0]))
     bag = SimpleNamespace(folder=tmp_path, messages=1)
-    its_node = session.NodeSession(None, SimpleNamespace(spin_once=spin_once))
+    node = SimpleNamespace(create_timer=lambda *_: None)
+    its_node = session.NodeSession(node, SimpleNamespace(spin_once=spin_once))
     monkeypatch.setattr(record, "node_session", lambda _: contextlib.nullcontext(its_node))
     monkeypatch.setattr(record, "stop_event", threading.Event)
     monkeypatch.setattr(record, "BagWriter", lambda *_: bag)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import shutil
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -76,7 +76,6 @@ class Recorder:
     Attributes:
         has_begun: Whether recording has begun, so that messages are kept.
         late: Topic that was connected after recording began -> how much later, in seconds.
-        received: Number of messages that have arrived.
         dropped: Number of messages that were not recorded, because the disk is too slow or writing
             has failed.
         counts: Topic that is recorded -> number of its messages that have arrived.
@@ -99,7 +98,7 @@ class Recorder:
         """
         self.has_begun = False
         self.late: dict[str, float] = {}
-        self.received = self.dropped = 0
+        self.dropped = 0
         self.counts: dict[str, int] = {}
         self.refused: dict[str, str] = {}
         self.error: BagError | None = None
@@ -110,7 +109,10 @@ class Recorder:
         self._unconnected: dict[str, Subscription] = {}
         self._latched: set[str] = set()
         self._connected_s = self._begin_s = 0.0
+        # Messages that the writing thread is to write, and those that are dropped if recording
+        # begins after them: topic, time of arrival in ns, and bytes.
         self._waiting: deque[tuple[str, int, bytes]] = deque()
+        self._early: list[tuple[str, int, bytes]] = []
         # The receiving thread changes only the first of these counts and the writing thread only
         # the second, so they need no lock.
         self._received_bytes = self._written_bytes = 0
@@ -124,6 +126,11 @@ class Recorder:
             daemon=True,
         )
         self._thread.start()
+
+    @property
+    def received(self) -> int:
+        """Number of messages that have arrived."""
+        return sum(self.counts.values())
 
     @property
     def missing(self) -> list[str]:
@@ -161,17 +168,12 @@ class Recorder:
         Args:
             now: Time of the monotonic clock, in seconds.
         """
-        topics = [topic for topic, _, _ in self._waiting]
-        early = Counter(topic for topic in topics if topic not in self._latched)
-        with self._lock:
-            kept = [one for one in self._waiting if one[0] in self._latched]
-            self._received_bytes = sum(len(data) for _, _, data in kept)
-            self._waiting = deque(kept)
-            self.has_begun = True
-            self._begin_s = now
-        for topic, count in early.items():
-            self.counts[topic] -= count
-        self.received -= early.total()
+        self._received_bytes -= sum(len(data) for _, _, data in self._early)
+        self._early.clear()
+        for topic in self.counts.keys() - self._latched:
+            self.counts[topic] = 0
+        self.has_begun = True
+        self._begin_s = now
 
     def close(self) -> None:
         """Write the messages that wait, and close the bag.
@@ -182,6 +184,9 @@ class Recorder:
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
         self._subscriptions.clear()
+        # If recording ends while topics are still awaited, the messages that have arrived until
+        # then are written nevertheless.
+        self._waiting.extend(self._early)
         self._closing.set()
         self._thread.join()
         if self.error is not None:
@@ -190,8 +195,9 @@ class Recorder:
     def _subscribe(self, topic: str, offers: list[TopicEndpointInfo]) -> None:
         type_name = offers[0].topic_type
         profile = match_offered_profile(offers, QUEUE_DEPTH)
+        is_latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
         recorded_profile = quality(
-            latched=profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+            latched=is_latched,
             reliable=profile.reliability == ReliabilityPolicy.RELIABLE,
             depth=QUEUE_DEPTH,
         )
@@ -199,11 +205,10 @@ class Recorder:
             self._bag.add_topic(topic, type_name, [recorded_profile])
         clock = self._node.get_clock()
         self.counts[topic] = 0
-        if profile.durability == DurabilityPolicy.TRANSIENT_LOCAL:
+        if is_latched:
             self._latched.add(topic)
 
         def receive(data: bytes) -> None:
-            self.received += 1
             self.counts[topic] += 1
             # Appending to a deque needs no lock. The deque has no limit of its size in bytes, so
             # the bytes that wait are counted here.
@@ -213,7 +218,9 @@ class Recorder:
                 self.dropped += 1
                 return
             self._received_bytes += len(data)
-            self._waiting.append((topic, clock.now().nanoseconds, data))
+            is_kept = self.has_begun or is_latched
+            messages = self._waiting if is_kept else self._early
+            messages.append((topic, clock.now().nanoseconds, data))
 
         kind = find_message_class(topic, type_name)
         subscription = self._node.create_subscription(
@@ -233,22 +240,16 @@ class Recorder:
             while not is_last:
                 is_last = self._closing.wait(WRITE_PERIOD_S)
                 with self._lock:
-                    # If recording ends while topics are still awaited, the messages that have
-                    # arrived until then are written nevertheless.
-                    if self.has_begun or is_last:
-                        self._write_waiting()
+                    while self._waiting:
+                        topic, time_ns, data = self._waiting.popleft()
+                        self._bag.write(topic, time_ns, data)
+                        self._written_bytes += len(data)
                     if time.monotonic() - flushed >= FLUSH_PERIOD_S:
                         self._bag.flush()
                         flushed = time.monotonic()
             self._bag.close()
         except BagError as error:
             self.error = error
-
-    def _write_waiting(self) -> None:
-        while self._waiting:
-            topic, time_ns, data = self._waiting.popleft()
-            self._bag.write(topic, time_ns, data)
-            self._written_bytes += len(data)
 
 
 def record(
@@ -288,7 +289,7 @@ def record(
             max_seconds,
         )
         recorder = Recorder(session.node, names, bag)
-        begin = find_at = show_at = time.monotonic()
+        begin = time.monotonic()
         until = float("inf") if duration is None else begin + duration
         has_come = False
 
@@ -302,18 +303,12 @@ def record(
                 until += now - begin
             return stop.is_set() or recorder.error is not None or now >= until
 
-        def find_and_show() -> None:
-            nonlocal find_at, show_at
-            now = time.monotonic()
-            if now >= find_at:
-                find_at = now + FIND_PERIOD_S
-                recorder.find_topics()
-            if now >= show_at:
-                show_at = now + SHOW_PERIOD_S
-                show(recorder, now - begin)
-
+        node = session.node
+        recorder.find_topics()
+        node.create_timer(FIND_PERIOD_S, recorder.find_topics)
+        node.create_timer(SHOW_PERIOD_S, lambda: show(recorder, time.monotonic() - begin))
         try:
-            spin_until(session.executor, is_done, on_step=find_and_show)
+            spin_until(session.executor, is_done)
         finally:
             _close(recorder, bag.folder)
         if not bag.messages:

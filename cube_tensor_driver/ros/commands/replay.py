@@ -2,16 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Replays a bag: publishes the recorded messages on their topics at the recorded intervals.
 
-The player publishes in a thread of its own. The main thread spins a node, which publishes the state
-of the player and offers a service to pause it and to jump to another position.
+The node of the player also publishes its state, and offers a service to pause it and to jump to
+another position.
 """
 
 from __future__ import annotations
 
 import math
-import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -60,6 +59,10 @@ In this part every cube was sampled at least once, so that viewers show the stre
 the new position.
 """
 
+MAX_STEP_S = 0.05
+"""Maximum time, in seconds, for which messages are published, or the next one is awaited, before
+requests and signals are looked at."""
+
 STATE_PERIOD_S = 0.1
 """Time, in seconds, between two messages on `~/state`, the state of the player."""
 
@@ -80,13 +83,12 @@ computes them anew from the replayed frequencies.
 class Player:
     """Publishes the messages of a bag (recording) at the intervals at which they were recorded.
 
-    `run` must be called only once; the other methods may be called from any thread meanwhile.
-
     Attributes:
         position: Time of the message published last, in s from the start of the bag.
         length: Duration of the bag, in s.
-        published: Number of messages published so far.
-        stop: Event that ends the method `run`; the method `end` sets it.
+        paused: Whether the replay is paused, by `pause`, by `jump` or at the end of the bag.
+        has_begun: Whether the replay has begun, by `begin` or by `jump`.
+        has_ended: Whether the replay is over.
     """
 
     def __init__(
@@ -95,6 +97,9 @@ class Player:
         bag: Bag,
         *,
         rate: float,
+        start: float,
+        loop: bool,
+        hold: bool,
         stress: bool,
         clock: bool,
     ) -> None:
@@ -104,27 +109,27 @@ class Player:
             node: The node that publishes.
             bag: The bag.
             rate: Speed of the replay, divided by the speed of the recording.
+            start: Position at which the replay begins, in s from the start of the bag.
+            loop: Whether the replay begins at `start` again after the end of the bag.
+            hold: Whether the replay pauses at the end of the bag, instead of ending there.
             stress: Whether to publish the recorded topics of a reconstruction (stress and wrenches)
                 as well.
             clock: Whether to publish /clock (simulated time).
 
         Raises:
-            BagError: A type of messages is not installed, or the bag has no topic to publish.
+            BagError: A type of messages is not installed, the bag has no topic to publish, or
+                `start` is negative or after the end of the bag.
         """
-        self.stop = threading.Event()
-        self.published = 0
         self.position = 0.0
         self.length = (bag.end_ns - bag.start_ns) / SECOND
-        self._paused = False
+        self.paused = self.has_begun = self.has_ended = False
         self._steps = 0
-        self._jump_ns: int | None = None
-        self._shown_until_ns = 0
-        # This condition variable guards the variables for pausing, stepping and jumping, which
-        # other threads change. It wakes the thread of `run` after a change.
-        self._wake = threading.Condition()
         self._node = node
         self._bag = bag
         self._rate = rate
+        self._begin_ns = self._to_ns(start)
+        self._loop = loop
+        self._hold = hold
         self._publishers: dict[str, Publisher] = {}
         self._latched: set[str] = set()
         # A bag may contain several skins in different namespaces; each has a topic `frequencies`.
@@ -140,92 +145,9 @@ class Player:
                 there = "but what a reconstruction makes; --stress publishes that too"
             raise BagError(f"{bag.path}: nothing to publish {there}")
         self._clock = node.create_publisher(Clock, "/clock", NEWEST) if clock else None
-
-    @property
-    def paused(self) -> bool:
-        """Whether the replay is paused, by `pause`, by `jump` or at the end of the bag."""
-        return self._paused
-
-    def pause(self, paused: bool) -> None:
-        """Pause the replay, or continue it if `paused` is false."""
-        with self._wake:
-            self._paused = paused
-            self._steps = 0
-            self._wake.notify()
-
-    def step(self) -> None:
-        """Publish all messages up to the next one of `frequencies`, and stay paused.
-
-        It has an effect only while the replay is paused.
-        """
-        with self._wake:
-            self._steps += 1
-            self._wake.notify()
-
-    def jump(self, position: float, paused: bool) -> None:
-        """Continue the replay at another position.
-
-        Args:
-            position: The position, in s from the start of the bag.
-            paused: Whether the replay pauses there. It does so after it has published `SHOWN_NS` of
-                the recording, so that viewers show the position.
-
-        Raises:
-            BagError: The position is negative or after the end of the bag.
-        """
-        # A jump to the end of the bag goes back by SHOWN_NS, so that there are messages to show.
-        latest_ns = self._bag.end_ns - SHOWN_NS
-        to_ns = min(self._to_ns(position), latest_ns)
-        to_ns = max(self._bag.start_ns, to_ns)
-        with self._wake:
-            self._jump_ns = to_ns
-            self._paused = paused
-            self._steps = 0
-            self._wake.notify()
-
-    def end(self) -> None:
-        """Make `run` return after the message that it publishes now."""
-        with self._wake:
-            self.stop.set()
-            self._wake.notify()
-
-    def run(
-        self,
-        start: float,
-        loop: bool,
-        hold: bool = False,
-    ) -> None:
-        """Publish the bag to its end.
-
-        Args:
-            start: Position at which the replay begins, in s from the start of the bag.
-            loop: Whether the replay begins at `start` again after the end of the bag.
-            hold: Whether the replay pauses at the end of the bag and waits for `jump`, `pause` or
-                `end`, instead of returning.
-
-        Raises:
-            BagError: The bag is damaged, or `start` is negative or after the end of the bag.
-        """
-        begin_ns: int | None = self._to_ns(start)
-        self._await_subscribers()
-        next_ns = begin_ns
-        while next_ns is not None and not self.stop.is_set():
-            self._publish_from(next_ns)
-            with self._wake:
-                if hold and not loop and self._jump_ns is None:
-                    self._paused = True
-                    self._wake.wait_for(self._has_request)
-                next_ns = begin_ns if loop or hold else None
-                self._shown_until_ns = 0
-                if self._jump_ns is not None:
-                    next_ns = self._jump_ns
-                    self._jump_ns = None
-                    self._shown_until_ns = next_ns + SHOWN_NS
-
-    def _has_request(self) -> bool:
-        """Return whether `end`, `jump` or `pause` ended the pause at the end of the bag."""
-        has_jump = self._jump_ns is not None
-        return self.stop.is_set() or has_jump or not self._paused
+        # Number of subscribers that `has_subscribers` has counted, and the time of its last change.
+        self._n_subscribers = 0
+        self._changed_s = time.monotonic()
 
     def _announce(self, topic: str, connection: Connection) -> None:
         """Make the publisher of a topic, with the quality of service of the recorded publisher.
@@ -244,28 +166,69 @@ class Player:
         if connection.is_latched:
             self._latched.add(topic)
 
-    def _await_subscribers(self) -> None:
-        """Wait until the topics have their subscribers, before the replay begins.
+    def has_subscribers(self) -> bool:
+        """Return whether the topics have their subscribers, so that the replay can begin.
 
-        The wait ends if `frequencies` has subscribers and no new one has come for `SETTLE_S`, or if
-        no new one has come for `MAX_WAIT_S`.
+        That is so if `frequencies` has subscribers and no new one has come for `SETTLE_S`, or if no
+        new one has come for `MAX_WAIT_S`. The method is to be called repeatedly.
         """
         publishers = list(self._publishers.values())
         if self._clock is not None:
             publishers.append(self._clock)
+        count = sum(publisher.get_subscription_count() for publisher in publishers)
+        if count != self._n_subscribers:
+            self._n_subscribers = count
+            self._changed_s = time.monotonic()
         # Each topic `frequencies` is to have a subscriber, the reconstruction node. If no such node
         # runs, the replay begins after MAX_WAIT_S.
         needed = [one for topic, one in self._publishers.items() if _is_frequencies(topic)]
-        count = 0
-        changed_s = time.monotonic()
-        wait_s = MAX_WAIT_S
-        while time.monotonic() - changed_s < wait_s and not self.stop.wait(LOOK_PERIOD_S):
-            count_before = count
-            count = sum(publisher.get_subscription_count() for publisher in publishers)
-            if count != count_before:
-                changed_s = time.monotonic()
-                all_heard = all(one.get_subscription_count() for one in needed or publishers)
-                wait_s = SETTLE_S if all_heard else MAX_WAIT_S
+        all_heard = all(one.get_subscription_count() for one in needed or publishers)
+        wait_s = SETTLE_S if all_heard else MAX_WAIT_S
+        has_waited = time.monotonic() - self._changed_s >= wait_s
+        return has_waited or self.has_begun or self.has_ended
+
+    def begin(self) -> None:
+        """Begin the replay at its start.
+
+        Raises:
+            BagError: The bag is damaged.
+        """
+        self._go_to(self._begin_ns)
+
+    def pause(self, paused: bool) -> None:
+        """Pause the replay, or continue it if `paused` is false."""
+        self.paused = paused
+        self._steps = 0
+
+    def step(self) -> None:
+        """Publish all messages up to the next one of `frequencies`, and stay paused.
+
+        It has an effect only while the replay is paused.
+        """
+        self._steps += 1
+
+    def jump(self, position: float, paused: bool) -> None:
+        """Continue the replay at another position.
+
+        Args:
+            position: The position, in s from the start of the bag.
+            paused: Whether the replay pauses there. It does so after it has published `SHOWN_NS` of
+                the recording, so that viewers show the position.
+
+        Raises:
+            BagError: The position is negative or after the end of the bag, or the bag is damaged.
+        """
+        # A jump to the end of the bag goes back by SHOWN_NS, so that there are messages to show.
+        latest_ns = self._bag.end_ns - SHOWN_NS
+        to_ns = min(self._to_ns(position), latest_ns)
+        to_ns = max(self._bag.start_ns, to_ns)
+        self.pause(paused)
+        self._go_to(to_ns)
+        self._shown_until_ns = to_ns + SHOWN_NS
+
+    def end(self) -> None:
+        """End the replay."""
+        self.has_ended = True
 
     def _to_ns(self, position: float) -> int:
         """Convert a position in the bag to the time of recording, in ns since the Unix epoch.
@@ -283,29 +246,19 @@ class Player:
             )
         return self._bag.start_ns + round(position * SECOND)
 
-    def _publish_from(self, start_ns: int) -> None:
-        """Publish messages until the end of the bag, a call of `jump`, or a call of `end`.
+    def _go_to(self, start_ns: int) -> None:
+        """Make the first message from a time of recording on, in ns, the next one.
 
-        Args:
-            start_ns: Time of recording of the first message, in ns since the Unix epoch.
+        Latched messages (such as `info`) from before are still valid then, and are published.
         """
-        # Latched messages (such as `info`) from before the start are still valid at the start.
         for entry in self._bag.entries(self._latched, stop_ns=start_ns):
-            self._publish(entry)
+            self._publishers[entry.topic].publish(entry.data)
+        self.has_begun = True
         self._set_time(start_ns)
-        for entry in self._bag.entries(set(self._publishers), start_ns):
-            if not self._wait_until_due(entry.time_ns):
-                return
-            # Nodes with simulated time must get the time of a message before the message itself,
-            # because otherwise its stamp would lie in the future.
-            self._publish_clock(entry.time_ns)
-            self._publish(entry)
-            # Other threads read the position. Assigning one attribute is atomic and needs no lock.
-            self.position = (entry.time_ns - self._bag.start_ns) / SECOND
-            # A step, requested by `step`, ends with the first message of `frequencies`.
-            if self._steps and _is_frequencies(entry.topic):
-                with self._wake:
-                    self._steps -= 1
+        self._entries: Iterator[Entry] = iter(self._bag.entries(set(self._publishers), start_ns))
+        self._next = next(self._entries, None)
+        self._shown_until_ns = 0
+        self._is_held = False
 
     def _set_time(self, bag_ns: int) -> None:
         """Set the pair of corresponding times from which the due time of each message is computed.
@@ -317,46 +270,73 @@ class Player:
         self._anchor_ns = bag_ns
         self._anchor_s = time.monotonic()
 
-    def _wait_until_due(self, bag_ns: int) -> bool:
-        """Wait until a message is due.
+    def advance(self) -> float:
+        """Publish the messages that are due.
+
+        Returns:
+            Time, in s, after which to call the method again, at most `MAX_STEP_S`.
+
+        Raises:
+            BagError: The bag is damaged.
+        """
+        until_s = time.monotonic() + MAX_STEP_S
+        while not self.has_ended and time.monotonic() < until_s:
+            entry = self._next
+            left_s = self._leave_end() if entry is None else self._find_left_s(entry.time_ns)
+            if left_s > 0:
+                return min(left_s, MAX_STEP_S)
+            if entry is None:
+                continue
+            # Nodes with simulated time must get the time of a message before the message itself,
+            # because otherwise its stamp would lie in the future.
+            self._publish_clock(entry.time_ns)
+            self._publishers[entry.topic].publish(entry.data)
+            self.position = (entry.time_ns - self._bag.start_ns) / SECOND
+            # A step, requested by `step`, ends with the first message of `frequencies`.
+            if self._steps and _is_frequencies(entry.topic):
+                self._steps -= 1
+            self._next = next(self._entries, None)
+        return 0.0
+
+    def _leave_end(self) -> float:
+        """At the end of the bag, begin again, end, or wait for a request.
+
+        Returns:
+            Time, in s, after which to call the method again; 0 if the end was left.
+        """
+        if self._hold and not self._loop and not self._is_held:
+            self._is_held = self.paused = True
+        if self._is_held and self.paused:
+            return MAX_STEP_S
+        if self._hold or self._loop:
+            self.begin()
+        else:
+            self.end()
+        return 0.0
+
+    def _find_left_s(self, bag_ns: int) -> float:
+        """Return the time, in s, until a message is due, or until /clock or a request is.
 
         While the replay is paused, a message is due only if it belongs to a step (see `step`) or to
         the time that is shown after a jump (see `SHOWN_NS`).
 
         Args:
             bag_ns: Time of recording of the message, in ns since the Unix epoch.
-
-        Returns:
-            Whether the message is to be published. False means that `end` or `jump` was called.
         """
-        with self._wake:
-            while not self.stop.is_set() and self._jump_ns is None:
-                if self._paused:
-                    if self._steps or bag_ns <= self._shown_until_ns:
-                        self._set_time(bag_ns)
-                        return True
-                    self._wake.wait()
-                    self._set_time(bag_ns)
-                    continue
-                since_anchor_s = (bag_ns - self._anchor_ns) / SECOND / self._rate
-                due_s = self._anchor_s + since_anchor_s
-                left_s = due_s - time.monotonic()
-                if left_s <= 0:
-                    return True
-                if self._clock is not None:
-                    left_in_bag_ns = round(left_s * self._rate * SECOND)
-                    self._publish_clock(bag_ns - left_in_bag_ns)
-                    left_s = min(left_s, CLOCK_PERIOD_S)
-                self._wake.wait(left_s)
-        return False
+        if self.paused:
+            self._set_time(bag_ns)
+            return 0.0 if self._steps or bag_ns <= self._shown_until_ns else MAX_STEP_S
+        since_anchor_s = (bag_ns - self._anchor_ns) / SECOND / self._rate
+        left_s = self._anchor_s + since_anchor_s - time.monotonic()
+        if self._clock is not None and left_s > 0:
+            left_in_bag_ns = round(left_s * self._rate * SECOND)
+            self._publish_clock(bag_ns - left_in_bag_ns)
+            left_s = min(left_s, CLOCK_PERIOD_S)
+        return left_s
 
     def _publish_clock(self, bag_ns: int) -> None:
         if self._clock is not None:
             self._clock.publish(Clock(clock=to_time(bag_ns)))
-
-    def _publish(self, entry: Entry) -> None:
-        self._publishers[entry.topic].publish(entry.data)
-        self.published += 1
 
 
 def _is_reconstructed(connection: Connection, skins: list[str]) -> bool:
@@ -436,41 +416,28 @@ def replay(
         stress: Whether to publish the recorded topics of a reconstruction (stress and wrenches) as
             well.
         hold: Whether the replay pauses at the end of the bag and waits for the service `~/steer`.
-        on_step: Called in the main thread with the player after each step of the executor, which
-            lasts 0.05 s at most, and at the end.
+        on_step: Called with the player about every `MAX_STEP_S`, and at the end.
 
     Raises:
         BagError: The bag cannot be read, or has no topic to publish.
     """
-    errors: list[BagError] = []
     with node_session("player") as (node, executor):
         player = Player(
             node,
             bag,
             rate=rate,
+            start=start,
+            loop=loop,
+            hold=hold,
             stress=stress,
             clock=clock,
         )
         ReplayControl(node, player)
+        node.create_timer(MAX_STEP_S, lambda: on_step(player))
         on_stop_signal(player.end)
-
-        def play() -> None:
-            try:
-                player.run(start, loop, hold=hold)
-            except BagError as error:
-                errors.append(error)
-
-        thread = threading.Thread(target=play, name="player")
-        thread.start()
-        try:
-            spin_until(
-                executor,
-                lambda: not thread.is_alive(),
-                on_step=lambda: on_step(player),
-            )
-        finally:
-            player.end()
-            thread.join()
+        spin_until(executor, player.has_subscribers, step_s=LOOK_PERIOD_S)
+        if not player.has_begun:
+            player.begin()
+        while not player.has_ended:
+            executor.spin_once(timeout_sec=player.advance())
         on_step(player)
-    if errors:
-        raise errors[0]
