@@ -20,9 +20,17 @@ def forces(*arrays: AnyArray | None) -> None:
     """Compute the specific force at the cubes of rows; core/compensation/motion.py states how.
 
     Args:
-        arrays: Times of M instants, in ns (M,), and the motion at them (M, 4, 3); positions (C, 4)
-            and rotations (C, 3, 3) of the cubes, in float32; cube (N,) and time stamp, in ns (N,),
-            of the rows; and the specific forces (N, 3) to write, in float32.
+        arrays: Arguments of `_find_forces`.
+
+    Raises:
+        ValueError: An array has another type or shape, or is not contiguous.
+    """
+
+def filter(*arrays: AnyArray) -> None:
+    """Advance low-pass filters; core/compensation/low_pass.py states how.
+
+    Args:
+        arrays: Arguments of `_advance`.
 
     Raises:
         ValueError: An array has another type or shape, or is not contiguous.

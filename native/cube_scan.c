@@ -141,8 +141,8 @@ INLINE int64_t apply_law(const cube_scan_call *call, block *b, const float *rest
 /* Subtracts from v (pad stress / stiffness) of a row what is no load: offset + (slope + gain * v) *
  * (time since since_ns) for creep and temperature, and response * force for weight. Sets the status
  * bits of the effects that are subtracted. */
-INLINE void subtract_offsets(const cube_scan_call *call, block *b, int64_t i) {
-    const int64_t n = call->length[P], row = b->row + i, cube = b->cube + i;
+INLINE void subtract_offsets(const cube_scan_call *call, block *b, int64_t i, int64_t n) {
+    const int64_t row = b->row + i, cube = b->cube + i;
     const float *offset = call->offset + cube * n, *slope = call->slope + cube * n;
     const float *gain = call->gain + cube * n;
     float *v = b->v + i * n, *reading = call->reading + cube * n, *sum = call->subtracted + cube * n;
@@ -360,7 +360,10 @@ INLINE int64_t process_block(const cube_scan_call *call, block *b) {
     }
     const int64_t n_good = apply_law(call, b, rest, highest);
     for (int64_t i = 0; i < b->n_rows && call->since_ns != NULL; i++)
-        subtract_offsets(call, b, i);
+        if (n == 8) /* a constant, so that the loops over pads become few instructions */
+            subtract_offsets(call, b, i, 8);
+        else
+            subtract_offsets(call, b, i, n);
     if (n_good != n_pads || is_doubtful)
         for (int64_t i = 0; i < b->n_rows; i++) {
             request = leave_out(call, b, i, highest);
@@ -424,7 +427,7 @@ int64_t cube_scan(const cube_scan_call *call, int64_t start, int64_t *request) {
  * NaN if it is unknown then. Times of a damaged recording may be any numbers, so differences wrap. */
 static void interpolate(const cube_forces_call *call, int64_t first, int64_t stamp_ns, float *state) {
     const int64_t n = call->length[M], *time_ns = call->time_ns + first;
-    const double *before = call->motion + first * 12;
+    const double *before = call->state + first * 12;
     double share = NAN;
     if (n > 1) {
         const int64_t length_ns = (int64_t)((uint64_t)time_ns[1] - (uint64_t)time_ns[0]);
@@ -443,7 +446,7 @@ static void interpolate(const cube_forces_call *call, int64_t first, int64_t sta
 
 void cube_forces(const cube_forces_call *call) {
     const int64_t last = call->length[M] - 2, *time_ns = call->time_ns;
-    float state[4][3]; /* specific force at the origin, and its derivatives along x, y and z */
+    float state[12]; /* specific force at the origin, then its gradient */
     int64_t first = 0;
     for (int64_t row = 0; row < call->length[N]; row++) {
         const int64_t cube = call->cube[row], stamp_ns = call->stamp_ns[row];
@@ -452,28 +455,74 @@ void cube_forces(const cube_forces_call *call) {
                 first--;
             while (first < last && time_ns[first + 1] <= stamp_ns)
                 first++;
-            interpolate(call, first, stamp_ns, state[0]);
+            interpolate(call, first, stamp_ns, state);
         }
-        const float *position = call->position + cube * 4, *rotation = call->rotation + cube * 9;
-        float *force = call->force + row * 3, in_parent[3] = {0};
+        const float *r = call->position + cube * 3, *rotation = call->rotation + cube * 9;
         const bool is_known = cube < call->length[C];
-        for (int k = 0; k < 4 && is_known; k++)
-            for (int axis = 0; axis < 3; axis++)
-                in_parent[axis] += position[k] * state[k][axis];
         for (int axis = 0; axis < 3; axis++)
-            force[axis] = is_known ? 0 : NAN;
-        for (int k = 0; k < 3 && is_known; k++)
+            call->force[row * 3 + axis] = is_known ? 0 : NAN;
+        for (int i = 0; i < 3 && is_known; i++) {
+            const float *g = state + 3 + i * 3;
+            const float in_parent = state[i] + g[0] * r[0] + g[1] * r[1] + g[2] * r[2];
             for (int axis = 0; axis < 3; axis++)
-                force[axis] += in_parent[k] * rotation[k * 3 + axis];
+                call->force[row * 3 + axis] += in_parent * rotation[i * 3 + axis];
+        }
     }
+}
+
+/* Computes the share m = 1 - exp(-ratio) for a ratio from 0 on, and m / ratio. `relaxed_share` in
+ * core/compensation/low_pass.py explains the series. */
+INLINE void relax(double ratio, double *share, double *mean) {
+    const double part = (ratio < 64 ? ratio : 64) / 1024;
+    double m = 0;
+    for (int n = 9; n > 0; n--)
+        m = part / n * (1 - m);
+    for (int halving = 0; halving < 10; halving++)
+        m *= 2 - m;
+    *share = m;
+    *mean = ratio > 0 ? m / (ratio > 1e-300 ? ratio : 1e-300) : 1;
+}
+
+CLONES void cube_filter(const cube_filter_call *call) {
+    const int64_t n_cubes = call->length[C], n = call->length[P], n_lanes = n_cubes * n;
+    const double *elapsed = call->elapsed_s, *ahead = call->ahead_s, *before = call->before, *now = call->now;
+    double *restrict output = call->sums, *restrict slope = output + n_lanes, *restrict gain = slope + n_lanes;
+    memset(call->sums, 0, (size_t)n_lanes * 3 * sizeof *call->sums);
+    for (int64_t k = 0; k < call->length[K]; k++) {
+        const double *time = call->time_s + k * n_cubes, *weight = call->weight + k * n_lanes;
+        double *restrict lag = call->lag + k * n_lanes;
+        for (int64_t begin = 0, end = 0; begin < n_cubes; begin = end) {
+            double share, mean, ahead_share, ahead_mean;
+            relax(elapsed[begin] / time[begin], &share, &mean);
+            relax(ahead[begin] / time[begin], &ahead_share, &ahead_mean);
+            const double kept = 1 - share, of_lag = ahead_share / ahead[begin];
+            const double of_change = (1 - ahead_mean) / ahead[begin];
+            /* Successive cubes often have the same time constant and intervals. */
+            do
+                call->share[k * n_cubes + end++] = share;
+            while (end < n_cubes && time[end] == time[begin] && elapsed[end] == elapsed[begin] &&
+                   ahead[end] == ahead[begin]);
+            LANES for (int64_t l = begin * n; l < end * n; l++) {
+                lag[l] = lag[l] * kept + mean * (now[l] - before[l]);
+                output[l] += weight[l] * (now[l] - lag[l]);
+                slope[l] += weight[l] * lag[l] * of_lag;
+                gain[l] += weight[l] * of_change;
+            }
+        }
+    }
+    LANES for (int64_t l = 0; l < n_lanes; l++)
+        slope[l] -= gain[l] * now[l];
 }
 
 #define SCAN(type, name, kind, shape, use) \
     {#name, shape, offsetof(cube_scan_call, name), sizeof(type), kind, CUBE_SCAN_##use},
 #define FORCES(type, name, kind, shape, use) \
     {#name, shape, offsetof(cube_forces_call, name), sizeof(type), kind, CUBE_SCAN_##use},
+#define FILTER(type, name, kind, shape, use) \
+    {#name, shape, offsetof(cube_filter_call, name), sizeof(type), kind, CUBE_SCAN_##use},
 const cube_scan_array cube_scan_arrays[CUBE_SCAN_N_ARRAYS] = {CUBE_SCAN_ARRAYS(SCAN)};
 const cube_scan_array cube_forces_arrays[CUBE_FORCES_N_ARRAYS] = {CUBE_FORCES_ARRAYS(FORCES)};
+const cube_scan_array cube_filter_arrays[CUBE_FILTER_N_ARRAYS] = {CUBE_FILTER_ARRAYS(FILTER)};
 _Static_assert(sizeof(cube_state) == 8 * 8, "the shape of words");
 
 cube_scan_call cube_scan_begin(void) {
@@ -485,6 +534,12 @@ cube_scan_call cube_scan_begin(void) {
 
 cube_forces_call cube_forces_begin(void) {
     cube_forces_call call = {0};
+    memset(call.length, -1, sizeof call.length);
+    return call;
+}
+
+cube_filter_call cube_filter_begin(void) {
+    cube_filter_call call = {0};
     memset(call.length, -1, sizeof call.length);
     return call;
 }

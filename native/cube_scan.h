@@ -134,8 +134,8 @@ int64_t cube_scan(const cube_scan_call *call, int64_t start, int64_t *request);
 /* Arrays of `cube_forces`, which core/compensation/motion.py describes. */
 #define CUBE_FORCES_ARRAYS(X)                    \
     X(const int64_t, time_ns, 'i', "M", INPUT)   \
-    X(const double, motion, 'f', "M43", INPUT)   \
-    X(const float, position, 'f', "C4", INPUT)   \
+    X(const double, state, 'f', "M43", INPUT)    \
+    X(const float, position, 'f', "C3", INPUT)   \
     X(const float, rotation, 'f', "C33", INPUT)  \
     X(const uint16_t, cube, 'u', "N", INPUT)     \
     X(const int64_t, stamp_ns, 'i', "N", INPUT)  \
@@ -154,5 +154,32 @@ cube_forces_call cube_forces_begin(void);
 
 /* Computes the specific force at the cube of each row, in the frame of the cube; NaN: unknown. */
 void cube_forces(const cube_forces_call *call);
+
+/* Arrays of `cube_filter`, which core/compensation/low_pass.py describes. Here K is the number of
+ * low-pass filters of each cube. */
+#define CUBE_FILTER_ARRAYS(X)                     \
+    X(const double, time_s, 'f', "KC", INPUT)     \
+    X(const double, weight, 'f', "KCP", INPUT)    \
+    X(const double, elapsed_s, 'f', "C", INPUT)   \
+    X(const double, before, 'f', "CP", INPUT)     \
+    X(const double, now, 'f', "CP", INPUT)        \
+    X(const double, ahead_s, 'f', "C", INPUT)     \
+    X(double, lag, 'f', "KCP", RESULT)            \
+    X(double, share, 'f', "KC", RESULT)           \
+    X(double, sums, 'f', "3CP", RESULT)
+
+typedef struct {
+    CUBE_FILTER_ARRAYS(CUBE_SCAN_FIELD)
+    int64_t length[sizeof CUBE_SCAN_LETTERS];
+} cube_filter_call;
+
+#define CUBE_FILTER_N_ARRAYS 9
+extern const cube_scan_array cube_filter_arrays[CUBE_FILTER_N_ARRAYS];
+
+/* Returns a call without arrays. */
+cube_filter_call cube_filter_begin(void);
+
+/* Advances the low-pass filters, and adds up their outputs. */
+void cube_filter(const cube_filter_call *call);
 
 #endif

@@ -83,8 +83,21 @@ static PyObject *forces(PyObject *module, PyObject *args) {
     return Py_NewRef(Py_None);
 }
 
+static PyObject *filter(PyObject *module, PyObject *args) {
+    (void)module;
+    cube_filter_call call = cube_filter_begin();
+    store_all(args, 0, cube_filter_arrays, CUBE_FILTER_N_ARRAYS, &call, call.length);
+    if (PyErr_Occurred())
+        return NULL;
+    cube_filter(&call);
+    return Py_NewRef(Py_None);
+}
+
 static PyMethodDef functions[] = {
-    {"run", run, METH_VARARGS, NULL}, {"forces", forces, METH_VARARGS, NULL}, {NULL, NULL, 0, NULL}};
+    {"run", run, METH_VARARGS, NULL},
+    {"forces", forces, METH_VARARGS, NULL},
+    {"filter", filter, METH_VARARGS, NULL},
+    {NULL, NULL, 0, NULL}};
 
 static struct PyModuleDef module = {
     PyModuleDef_HEAD_INIT, .m_name = "_scan", .m_size = -1, .m_methods = functions};

@@ -1,16 +1,19 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Decoding of SkinCompensation: motion of the skin, and states of effects."""
+"""Encoding and decoding of SkinCompensation: motion of the skin, and states of effects."""
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..core.arrays import Array
-from ..core.compensation.motion import Motion
+from ..core.compensation.motion import UNKNOWN_MOTION, Motion
 from ..core.errors import MessageError
+from .codec import LITTLE_ENDIAN, SECOND
 
 if TYPE_CHECKING:
     from ..msg import SkinCompensation
@@ -18,6 +21,38 @@ if TYPE_CHECKING:
 STATES = ("creep", "thermal")
 """Names of those fields of SkinCompensation.msg that contain the state of a compensated effect
 (viscoelastic creep; temperature of the elastomer)."""
+
+
+NO_STATE = np.zeros(0)
+"""State of an effect that is not compensated, or not recorded in a message."""
+
+
+def encode_compensation(
+    frame_id: str,
+    stamp_ns: int,
+    motion: Motion | None,
+    states: Mapping[str, Array],
+) -> bytes:
+    """Return a serialised SkinCompensation: what a recording needs to repeat a compensation.
+
+    Args:
+        frame_id: Parent frame of the skin.
+        stamp_ns: Stamp of the messages of frequencies and stress to which the message belongs, in
+            ns since the Unix epoch.
+        motion: Motion of the skin; None: weight is not compensated.
+        states: Name of a compensated effect, one of `STATES` -> its state, as `Compensation.states`
+            returns it.
+    """
+    time_ns, state = motion or UNKNOWN_MOTION
+    text = frame_id.encode() + b"\0"
+    header = struct.pack("<iII", *divmod(stamp_ns, SECOND), len(text))
+    data = header + text + bytes([motion is not None])
+    effects = [states.get(name, NO_STATE) for name in STATES]
+    for values in (time_ns - stamp_ns, state[:, 0], state[:, 1:], *effects):
+        data += bytes(-len(data) % 4) + struct.pack("<I", values.size)
+        if values.size:
+            data += bytes(-len(data) % 8) + values.tobytes()
+    return LITTLE_ENDIAN + data
 
 
 def read_motion(message: SkinCompensation, stamp_ns: int) -> Motion | None:
@@ -39,16 +74,13 @@ def read_motion(message: SkinCompensation, stamp_ns: int) -> Motion | None:
     force = np.asarray(message.specific_force, float)
     gradient = np.asarray(message.gradient, float)
     try:
-        return Motion(
-            stamp_ns + offsets,
-            force.reshape(n, 3),
-            gradient.reshape(n, 3, 3),
-        )
+        parts = force.reshape(n, 1, 3), gradient.reshape(n, 3, 3)
     except ValueError:
         raise MessageError(
             f"compensation: {len(offsets)} instants with {len(message.specific_force)} numbers of "
             f"specific force and {len(message.gradient)} of its gradient; 3 and 9 each are needed"
         ) from None
+    return Motion(stamp_ns + offsets, np.concatenate(parts, axis=1))
 
 
 def read_states(message: SkinCompensation) -> dict[str, Array]:

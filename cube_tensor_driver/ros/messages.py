@@ -32,7 +32,6 @@ from std_msgs.msg import Header
 from ..config.calibration import format_calibration
 from ..config.skin import Elastomer, Skin, SkinCube
 from ..core.arrays import AnyArray, Array, Real
-from ..core.compensation.motion import UNKNOWN_MOTION, Motion
 from ..core.errors import BagError
 from ..core.pipeline import Pipeline
 from ..core.rows import StressRows
@@ -40,7 +39,6 @@ from ..core.tensor import quaternion_from_rpy
 from ..messages.codec import SECOND
 from ..msg import (
     CubeInfo,
-    SkinCompensation,
     SkinInfo,
     StressTensor,
     StressTensorStamped,
@@ -169,35 +167,6 @@ def make_message(type_name: str, **fields: object) -> Any:
         if isinstance(value, np.ndarray)
     }
     return find_message_class("make_message", type_name)(**fields | arrays)
-
-
-def make_compensation_message(
-    frame_id: str,
-    stamp_ns: int,
-    motion: Motion | None,
-    states: Mapping[str, Array],
-) -> SkinCompensation:
-    """Return a SkinCompensation message: what a recording must contain to repeat a compensation.
-
-    Args:
-        frame_id: Parent frame of the skin.
-        stamp_ns: Stamp of the messages of frequencies and stress to which the message belongs, in
-            ns since the Unix epoch.
-        motion: Motion of the skin; None: weight is not compensated.
-        states: Name of a compensated effect ("creep" or "thermal") -> its state, as
-            `Compensation.states` returns it.
-    """
-    known = motion or UNKNOWN_MOTION
-    header = Header(stamp=to_time(stamp_ns), frame_id=frame_id)
-    packed_states = {name: pack_array("d", state) for name, state in states.items()}
-    return SkinCompensation(
-        header=header,
-        weight=motion is not None,
-        time_offset=pack_array("q", known.time_ns - stamp_ns),
-        specific_force=pack_array("d", known.specific_force),
-        gradient=pack_array("d", known.gradient),
-        **packed_states,
-    )
 
 
 def pack_array(code: str, values: AnyArray) -> array[Any]:

@@ -41,10 +41,6 @@ MAX_TRANSFORM_AGE_NS = SECOND
 of a cube). With an older transform the direction of gravity counts as unknown. The limit does not
 apply to static transforms."""
 
-CROSS_OF_AXES = np.cross(np.eye(3)[:, None], np.eye(3)).swapaxes(1, 2).reshape(3, 9)
-"""Matrices of the cross products with the unit vectors e along x, y and z, (3, 9). Each row holds
-the 9 numbers, row by row, of the matrix whose product with any vector r is e x r."""
-
 
 class MissingMotion(CubeError):
     """The motion of the skin is unknown. The text of the error states the reason and the remedy."""
@@ -167,9 +163,9 @@ class GravityMotion:
                 f"{abs(age_ns) / 1e9:.1f} s {side} than the rows: see who publishes it, and that "
                 "clocks agree"
             )
-        up = STANDARD_GRAVITY * rotation[:, 2]
-        no_rotation = np.zeros((1, 3, 3))
-        return Motion(np.array([last_ns]), up[None], no_rotation)
+        state = np.zeros((1, 4, 3))
+        state[0, 0] = STANDARD_GRAVITY * rotation[:, 2]
+        return Motion(np.array([last_ns]), state)
 
 
 IMU_HEADER = struct.Struct("<4xiII")
@@ -182,27 +178,33 @@ velocity, linear acceleration, and the first element of the covariance of the li
 Orientation and other covariances are skipped."""
 
 Vector = tuple[float, ...]
-"""Components x, y and z of a vector. Computing with three floats is faster than with an array."""
+"""Few numbers, such as the components x, y and z of a vector. Computing with floats is faster than
+with a short array."""
+
+UNKNOWN: Vector = (math.nan,) * 3
+"""Vector that is not known."""
+
+MOUNTING_PERIOD_NS = SECOND
+"""Time, in ns, after which the transform from an IMU to the parent frame is read again. It rarely
+changes, because both are fixed to one rigid body."""
 
 
 class _Sample(NamedTuple):
-    """One sample of an IMU, with its vectors in the frame of the IMU.
+    """One sample of an IMU, in the frame of the IMU.
 
     Attributes:
         time_ns: Time of the sample, in ns since the Unix epoch.
-        specific_force: Specific force (acceleration minus gravity), in m/s².
         angular_velocity: Angular velocity, in rad/s.
-        angular_acceleration: Angular acceleration, in rad/s²; NaN if there was no sample shortly
-            before, from whose angular velocity it follows.
         mean_acceleration: Mean angular acceleration since the sample before, in rad/s²; None if
             there was none shortly before.
+        motion: Specific force, in m/s², then the 9 numbers of its gradient row by row, as in
+            `Motion`; the gradient is NaN if there was no sample shortly before.
     """
 
     time_ns: int
-    specific_force: Vector
     angular_velocity: Vector
-    angular_acceleration: Vector = (math.nan,) * 3
-    mean_acceleration: Vector | None = None
+    mean_acceleration: Vector | None
+    motion: Vector
 
 
 class ImuMotion:
@@ -228,6 +230,9 @@ class ImuMotion:
         # it is replaced by another list to drop some.
         self._samples: list[_Sample] = []
         self._imu_frame = parent_frame
+        # Result of `_find_mounting`; frame of the IMU, and time at which the transform was read.
+        self._mounting = np.eye(12)
+        self._mounted = "", 0
         self._problem = f"no message on {topic}: start the IMU, or set imu to its topic"
         self._node = node
         node.own(
@@ -247,32 +252,34 @@ class ImuMotion:
         `motion` raises.
         """
         try:
-            sample, self._imu_frame = _decode(data)
+            time_ns, force, velocity, self._imu_frame = _decode(data)
         except (ValueError, struct.error) as error:
             log_refused_message(self._node, self._topic, error)
             return
-        velocity = sample.angular_velocity
-        if not math.isfinite(sum(sample.specific_force) + sum(velocity)):
+        if not math.isfinite(sum(force) + sum(velocity)):
             self._problem = f"{self._topic} states no acceleration: name an IMU that measures it"
             return
-        before = self._samples[-1] if self._samples else sample
-        interval_ns = sample.time_ns - before.time_ns
-        if interval_ns <= 0:
-            # Time went back, because a replay has jumped or a clock was set. Older samples cannot
-            # be compared with new ones any more.
-            self._samples = []
-        elif interval_ns <= MAX_INTERVAL_NS:
-            changes = zip(velocity, before.angular_velocity, strict=True)
-            mean = tuple((now - then) * SECOND / interval_ns for now, then in changes)
-            # The mean angular acceleration is taken as that in the middle of the interval between
-            # the samples. It is extrapolated linearly to the end of the interval, the time of the
-            # new sample.
-            means = zip(mean, before.mean_acceleration or mean, strict=True)
-            acceleration = tuple(1.5 * now - 0.5 * then for now, then in means)
-            sample = sample._replace(angular_acceleration=acceleration, mean_acceleration=mean)
+        mean, acceleration = None, UNKNOWN
+        if self._samples:
+            before = self._samples[-1]
+            interval_ns = time_ns - before.time_ns
+            if interval_ns <= 0:
+                # Time went back, because a replay has jumped or a clock was set. Older samples
+                # cannot be compared with new ones any more.
+                self._samples = []
+            elif interval_ns <= MAX_INTERVAL_NS:
+                rate = SECOND / interval_ns
+                changes = zip(velocity, before.angular_velocity, strict=True)
+                mean = tuple([(now - then) * rate for now, then in changes])
+                # The mean angular acceleration is taken as that in the middle of the interval
+                # between the samples. It is extrapolated linearly to the end of the interval, the
+                # time of the new sample.
+                means = zip(mean, before.mean_acceleration or mean, strict=True)
+                acceleration = tuple([1.5 * now - 0.5 * then for now, then in means])
         if len(self._samples) == MAX_SAMPLES:
             self._samples = self._samples[MAX_SAMPLES // 2 :]
-        self._samples.append(sample)
+        motion = force + _find_gradient(velocity, acceleration)
+        self._samples.append(_Sample(time_ns, velocity, mean, motion))
 
     def motion(self, first_ns: int, last_ns: int) -> Motion:
         """Return the motion at the times of the IMU's samples before, in and after a span of time.
@@ -309,23 +316,37 @@ class ImuMotion:
                 "has stopped or is late, or its clock differs from that of this computer"
             )
         chosen = samples[first : last + 1]
-        rotation, position, _ = self._transforms.newest(self._parent_frame, self._imu_frame)
-        in_imu = np.array([sample[1:4] for sample in chosen])
-        force, velocity, acceleration = (in_imu @ rotation.T).swapaxes(0, 1)
-        # The acceleration of a rigid body at the position r, relative to its origin, is
-        # alpha x r + omega x (omega x r) = G r, with angular acceleration alpha, angular velocity
-        # omega, and the gradient G.
-        turning = _make_cross_matrices(velocity)
-        gradient = _make_cross_matrices(acceleration) + turning @ turning
         time_ns = np.array([sample.time_ns for sample in chosen])
-        return Motion(time_ns, force - gradient @ position, gradient)
+        in_imu = np.array([sample.motion for sample in chosen])
+        in_parent = in_imu @ self._find_mounting(last_ns)
+        return Motion(time_ns, in_parent.reshape(-1, 4, 3))
+
+    def _find_mounting(self, now_ns: int) -> Array:
+        """Return the matrix (12, 12) that the motion of a sample is multiplied by from the right.
+
+        The product is the motion in the parent frame, of which G' = R G R^T and s' = R s - G' p,
+        with the rotation R and the position p of the IMU.
+        """
+        frame, read_ns = self._mounted
+        if frame != self._imu_frame or abs(now_ns - read_ns) > MOUNTING_PERIOD_NS:
+            frame = self._imu_frame
+            rotation, position, _ = self._transforms.newest(self._parent_frame, frame)
+            of_gradient = np.kron(rotation, rotation)
+            lever = -np.kron(np.eye(3), position) @ of_gradient
+            self._mounting = np.zeros((12, 12))
+            self._mounting[:3, :3] = rotation.T
+            self._mounting[3:, :3] = lever.T
+            self._mounting[3:, 3:] = of_gradient.T
+            self._mounted = frame, now_ns
+        return self._mounting
 
 
-def _decode(data: bytes) -> tuple[_Sample, str]:
-    """Return the sample in a serialised message sensor_msgs/Imu, and the name of its frame.
+def _decode(data: bytes) -> tuple[int, Vector, Vector, str]:
+    """Decode a serialised message sensor_msgs/Imu; rclpy takes ten times as long for all of it.
 
-    The specific force is NaN if the IMU does not measure it. Decoding of the whole message by rclpy
-    takes ten times as long.
+    Returns:
+        Time stamp, in ns; specific force, NaN if the IMU does not measure it; angular velocity; and
+        name of the frame.
 
     Raises:
         struct.error: The message is too short.
@@ -339,16 +360,25 @@ def _decode(data: bytes) -> tuple[_Sample, str]:
     begin = -(-(text_end - 4) // 8) * 8 + 4
     numbers = IMU_NUMBERS.unpack_from(data, begin)
     # According to sensor_msgs/Imu, a first covariance of -1 means that there is no measurement.
-    force = numbers[3:6] if numbers[6] != -1 else (math.nan,) * 3
-    sample = _Sample(seconds * SECOND + nanoseconds, force, numbers[:3])
-    return sample, data[IMU_HEADER.size : text_end - 1].decode()
+    force = numbers[3:6] if numbers[6] != -1 else UNKNOWN
+    frame = data[IMU_HEADER.size : text_end - 1].decode()
+    return seconds * SECOND + nanoseconds, force, numbers[:3], frame
 
 
-def _make_cross_matrices(vectors: Array) -> Array:
-    """Return matrices (K, 3, 3) whose products with any r are the cross products vector x r.
+def _find_gradient(velocity: Vector, acceleration: Vector) -> Vector:
+    """Return the gradient of the specific force on a rigid body, 9 numbers row by row, in 1/s².
+
+    The acceleration at the position r relative to that at the origin is
+    alpha x r + omega x (omega x r) = G r with the gradient G.
 
     Args:
-        vectors: The vectors (K, 3).
+        velocity: Angular velocity omega, in rad/s.
+        acceleration: Angular acceleration alpha, in rad/s².
     """
-    matrices: Array = (vectors @ CROSS_OF_AXES).reshape(-1, 3, 3)
-    return matrices
+    x, y, z = velocity
+    a, b, c = acceleration
+    return (
+        *(-y * y - z * z, x * y - c, x * z + b),
+        *(x * y + c, -x * x - z * z, y * z - a),
+        *(x * z - b, y * z + a, -x * x - y * y),
+    )

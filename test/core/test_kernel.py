@@ -53,12 +53,14 @@ N_OFFSETS = 12
 from the readings of the pads."""
 N_CUBE_STATE = 4
 """Number of arrays of compensation that the kernel writes. They are the last of `N_OFFSETS`."""
+N_FILTERED = 3
+"""Number of arrays that low-pass filters write. They are the last of their arguments."""
 N_COLUMNS = 8
 """Number of arrays with columns of frequencies that a call of the kernel takes."""
 
 
 class ScanProcess:
-    """The kernel in a process of its own, with the function of the module."""
+    """The kernel in a process of its own, with functions of the module."""
 
     def __init__(self, command: list[str]) -> None:
         pipe = subprocess.PIPE
@@ -66,15 +68,20 @@ class ScanProcess:
 
     def run(self, *arguments):
         numbers, arrays = arguments[:2], arguments[2:]
+        health, rest = arrays[N_TABLES:][:N_HEALTH], arrays[N_TABLES + N_HEALTH :]
+        offsets, results = rest[N_OFFSETS - N_CUBE_STATE : N_OFFSETS], rest[N_OFFSETS + N_COLUMNS :]
+        return self._call([0, *numbers], arrays, [*health, *offsets, *results])
+
+    def filter(self, *arrays):
+        self._call([1, 0, 0], arrays, arrays[-N_FILTERED:])
+
+    def _call(self, numbers, arrays, written):
         call = [np.array(numbers, np.int64).tobytes()]
         for array in arrays:
             size = -1 if array is None else array.nbytes
             shape = () if array is None else array.shape
             call.append(np.array([size, len(shape), *shape], np.int64).tobytes())
             call.append(b"" if array is None else array.tobytes())
-        health, rest = arrays[N_TABLES:][:N_HEALTH], arrays[N_TABLES + N_HEALTH :]
-        offsets, results = rest[N_OFFSETS - N_CUBE_STATE : N_OFFSETS], rest[N_OFFSETS + N_COLUMNS :]
-        written = [*health, *offsets, *results]
         try:
             self._process.stdin.write(b"".join(call))
             self._process.stdin.flush()

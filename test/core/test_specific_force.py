@@ -38,8 +38,7 @@ def test_c_and_numpy_give_the_same_bits(monkeypatch, instants_ms):
     """With no instant, one, equal ones, and gaps; before, between and after them."""
     known = Motion(
         np.array(instants_ms, np.int64) * 1_000_000,
-        RNG.normal(size=(len(instants_ms), 3)),
-        RNG.normal(size=(len(instants_ms), 3, 3)),
+        RNG.normal(size=(len(instants_ms), 4, 3)),
     )
     stamps = np.repeat(RNG.integers(-60_000_000, 380_000_000, 400), 3)
     rows = rows_at(np.append(stamps, np.array(instants_ms, np.int64) * 1_000_000))
@@ -61,11 +60,8 @@ def test_the_force_is_that_of_a_point_of_a_turning_body(monkeypatch, compiled):
     turning, turning_faster = (np.cross(vector, np.eye(3)).T for vector in (omega, alpha))
     gradient = turning_faster + turning @ turning
     scale = np.array([0.0, 2.0])
-    known = Motion(
-        np.array([0, 2_000_000]),
-        scale[:, None] * force,
-        scale[:, None, None] * gradient,
-    )
+    state = scale[:, None, None] * np.vstack([force, gradient])
+    known = Motion(np.array([0, 2_000_000]), state)
     rows = rows_at(np.full(CUBES, 1_000_000))
     found = ForcesAtCubes(POSES).add_to(rows, known).specific_force
     for cube in range(CUBES):

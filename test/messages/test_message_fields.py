@@ -25,7 +25,7 @@ from cube_tensor_driver.core.compensation.motion import Motion
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
-from cube_tensor_driver.messages.compensation import read_motion
+from cube_tensor_driver.messages.compensation import encode_compensation, read_motion
 from cube_tensor_driver.messages.contacts import (
     decode_contacts,
     make_contacts_message,
@@ -179,18 +179,25 @@ def test_each_number_of_a_tensor_and_a_wrench_is_in_its_field():
 
 def test_a_compensation_says_whether_and_when_the_weight_is_known():
     pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
-    from cube_tensor_driver.ros.messages import make_compensation_message
+    from rclpy.serialization import deserialize_message
 
-    motion = Motion(START_NS + np.array([-7, 9]), np.arange(6.0), np.arange(18.0))
-    states = {"thermal": np.arange(3.0)}
-    message = make_compensation_message("wrist", START_NS + 5, motion, states)
+    from cube_tensor_driver.msg import SkinCompensation
+
+    def sent(*values):
+        return deserialize_message(encode_compensation("wrist", *values), SkinCompensation)
+
+    motion = Motion(START_NS + np.array([-7, 9]), np.arange(24.0).reshape(2, 4, 3))
+    message = sent(START_NS + 5, motion, {"thermal": np.arange(3.0)})
     assert message.header.frame_id == "wrist" and message.weight
     assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == START_NS + 5
     assert message.time_offset.tolist() == [-12, 4]
-    assert message.specific_force.tolist() == list(range(6))
-    assert message.gradient.tolist() == list(range(18))
+    assert message.specific_force.tolist() == [0, 1, 2, 12, 13, 14]
+    assert message.gradient.tolist() == [*range(3, 12), *range(15, 24)]
+    found = read_motion(message, START_NS + 5)
+    np.testing.assert_array_equal(found.time_ns, motion.time_ns)
+    np.testing.assert_array_equal(found.state, motion.state)
     assert (list(message.creep), message.thermal.tolist()) == ([], [0, 1, 2])
-    without = make_compensation_message("wrist", START_NS, None, {})
+    without = sent(START_NS, None, {})
     assert not without.weight and read_motion(without, START_NS) is None
 
 

@@ -14,15 +14,14 @@ import pytest
 pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 
-from bag_maker import header, message
 from moving_skin import G, MovingSkin
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
-from rclpy.serialization import serialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu
 
 from conftest import decoded, encoded
-from cube_tensor_driver.bags.metadata import make_typestore, quality
+from cube_tensor_driver.bags.metadata import quality
 from cube_tensor_driver.bags.read import Bag
 from cube_tensor_driver.bags.reprocess.job import ReprocessJob, reconstruct, reprocess
 from cube_tensor_driver.bags.reprocess.table import frequency_table, reprocess_table
@@ -40,7 +39,7 @@ from cube_tensor_driver.core.tensor import rotation_from_rpy
 from cube_tensor_driver.messages.codec import stress_codec
 from cube_tensor_driver.messages.types import COMPENSATION as COMPENSATION_TYPE
 from cube_tensor_driver.messages.types import FREQUENCIES, INFO, STRESS
-from cube_tensor_driver.msg import SkinStress
+from cube_tensor_driver.msg import SkinCompensation, SkinStress
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
 from cube_tensor_driver.ros.messages import to_ns, to_time
@@ -291,13 +290,9 @@ def write_lasting_effects(folder, ramp: float = 0.0) -> None:
     write_calibration(folder / "heavy.yaml", replace(cube, creep=creep, thermal=thermal))
 
 
-def as_sent(one) -> bytes:
-    """The bytes of a SkinCompensation; serialize_message adds some after empty lists."""
-    names = ("time_offset", "specific_force", "gradient", "creep", "thermal")
-    lists = {name: np.array(getattr(one, name)) for name in names}
-    stamped = header(to_ns(one.header.stamp), one.header.frame_id)
-    made = message(COMPENSATION_TYPE, header=stamped, weight=one.weight, **lists)
-    return bytes(make_typestore().serialize_cdr(made, COMPENSATION_TYPE))
+def decode_compensation(node) -> list[SkinCompensation]:
+    """The messages on the topic `compensation` that the node has sent."""
+    return [deserialize_message(data, SkinCompensation) for data in node.sent["compensation"]]
 
 
 def write_bag(folder, node, rows: FrequencyRows, dropped: range) -> None:
@@ -306,7 +301,6 @@ def write_bag(folder, node, rows: FrequencyRows, dropped: range) -> None:
     topics["compensation"] = COMPENSATION_TYPE
     scans = [rows.select(slice(k, k + 2)) for k in range(0, len(rows), 2)]
     frequencies = [encoded(scan, b"tool\0") for scan in scans]
-    compensation = [as_sent(one) for one in node.sent["compensation"]]
     with BagWriter(folder) as writer:
         for topic, kind in topics.items():
             writer.add_topic(f"/{topic}", kind, [quality(latched=topic == "info")])
@@ -315,7 +309,7 @@ def write_bag(folder, node, rows: FrequencyRows, dropped: range) -> None:
             time_ns = int(scan.stamp_ns[0])
             writer.write("/frequencies", time_ns, frequencies[k])
             if k not in dropped:
-                writer.write("/compensation", time_ns + 1, compensation[k])
+                writer.write("/compensation", time_ns + 1, node.sent["compensation"][k])
             writer.write("/stress", time_ns + 2, node.sent["stress"][k])
 
 
@@ -423,7 +417,7 @@ def test_a_missing_imu_is_one_line_and_the_node_goes_on(start, monkeypatch, case
     node.on_rows(scan_at(row_s))
     (stress,) = node.sent["stress"]
     assert (stress_codec.decode(stress).rows.status & COMPENSATION).all()
-    (motion,) = node.sent["compensation"]
+    (motion,) = decode_compensation(node)
     assert motion.weight and not len(motion.time_offset)
     status = node._statuses()[0]
     assert text in status.message and "weight is not compensated" in status.message
@@ -434,12 +428,12 @@ def test_a_missing_imu_is_one_line_and_the_node_goes_on(start, monkeypatch, case
 def test_an_imu_is_decoded_as_by_rclpy_whatever_its_frame(frame):
     message = imu_message(MovingSkin(), 0.123)
     message.header.frame_id = frame
-    sample, found = _decode(serialize_message(message))
+    time_ns, force, velocity, found = _decode(serialize_message(message))
     assert found == frame
-    assert sample.time_ns == to_ns(message.header.stamp)
+    assert time_ns == to_ns(message.header.stamp)
     for vector, expected in (
-        (sample.specific_force, message.linear_acceleration),
-        (sample.angular_velocity, message.angular_velocity),
+        (force, message.linear_acceleration),
+        (velocity, message.angular_velocity),
     ):
         assert vector == (expected.x, expected.y, expected.z)
 
@@ -452,7 +446,7 @@ def test_gravity_comes_from_tf_alone(start, monkeypatch):
     node = start(gravity="world")
     node.on_rows(scan_at(0.1))
     node.on_rows(scan_at(1.5))
-    known, old = node.sent["compensation"]
+    known, old = decode_compensation(node)
     np.testing.assert_allclose(known.specific_force, turned[:, 2] * G)
     assert not len(old.time_offset)
     assert "transform from world to tool is 1.4 s older" in node._statuses()[0].message

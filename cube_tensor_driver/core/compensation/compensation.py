@@ -51,10 +51,10 @@ class Compensation:
         shape = n_cubes, pipeline.n_pads
         real = pipeline.dtype
         self._weight = Weight(pipeline)
-        stiffness = pipeline.stiffness
+        stiffness = pipeline.stiffness[..., None]
         # For a pad that the cube does not have, the quotient is 0.
         stiffness = np.where(stiffness > 0, stiffness, np.inf)
-        response = self._weight.response / stiffness[:, None]
+        response = (self._weight.response / stiffness).swapaxes(1, 2)
         weighing = np.where(self._weight.has_model, WEIGHT, COMPENSATION)
         self.offsets = Offsets(
             step_ns=np.zeros(2, np.int64),
@@ -63,7 +63,7 @@ class Compensation:
             slope=np.zeros(shape, real),
             gain=np.zeros(shape, real),
             lasting=np.zeros(n_cubes, np.uint16),
-            response=response.astype(real),
+            response=np.ascontiguousarray(response, real),
             weighing=weighing.astype(np.uint16),
             newest_ns=np.zeros(n_cubes, np.int64),
             reading=np.zeros(shape, real),
@@ -134,12 +134,11 @@ class Compensation:
         divided by stiffness).
         """
         thermal = self._thermal.offset
-        self.offsets.offset[:] = (thermal + self.creep.offset).T
+        self.offsets.offset[:] = thermal + self.creep.offset
         # The kernel multiplies the gain by the whole reading of a pad, but creep depends only on
         # the reading minus the effect of temperature. The slope contains the difference.
-        correction = self.creep.gain * thermal
-        self.offsets.slope[:] = (self.creep.slope - correction).T
-        self.offsets.gain[:] = self.creep.gain.T
+        self.offsets.slope[:] = self.creep.slope - self.creep.gain * thermal
+        self.offsets.gain[:] = self.creep.gain
         self.offsets.lasting[:] = 0
         for effect in self._lasting:
             bits = np.where(effect.is_known, effect.bit, COMPENSATION)

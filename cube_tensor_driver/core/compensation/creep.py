@@ -59,9 +59,9 @@ class Creep:
 
     Attributes:
         has_model: Whether the calibration of a cube has a law of creep (C,).
-        offset: Creep in the newest row of each cube at the last step (P, C).
-        slope: Factor of t (P, C), per second.
-        gain: Factor of u t (P, C), per second.
+        offset: Creep in the newest row of each cube at the last step (C, P).
+        slope: Factor of t (C, P), per second.
+        gain: Factor of u t (C, P), per second.
     """
 
     key = "creep"
@@ -76,34 +76,34 @@ class Creep:
         """
         self._pipeline = pipeline
         self._newest = offsets
-        self._models = [calibration.creep for calibration in pipeline.calibrations]
-        self.has_model = np.array([model is not None for model in self._models])
-        n_cubes, n_pads = offsets.reading.shape
-        times = [model.time for model in self._models if model is not None]
-        self._times = np.unique(np.hstack([[], *times]))
+        models = [calibration.creep for calibration in pipeline.calibrations]
+        self.has_model = np.array([model is not None for model in models])
+        shape = offsets.reading.shape
+        present = {cube: model for cube, model in enumerate(models) if model is not None}
+        self._times = np.unique(np.hstack([[], *(model.time for model in present.values())]))
+        n_times = len(self._times)
+        self._amplitude = np.zeros((n_times, *shape))
+        # Errors of the amplitudes by independent causes (causes, K, C, P).
+        stated = [model.deviation for model in present.values() if model.deviation is not None]
+        n_causes = max(map(len, stated), default=0)
+        self._amplitude_errors = np.zeros((n_causes, *self._amplitude.shape))
+        for cube, model in present.items():
+            filters = np.searchsorted(self._times, model.time)
+            pads = slice(model.n_pads)
+            self._amplitude[filters, cube, pads] = model.amplitude.T
+            for cause, deviation in enumerate(
+                model.deviation if model.deviation is not None else ()
+            ):
+                self._amplitude_errors[cause, filters, cube, pads] = deviation.T
+        n_cubes = len(models)
         time = np.repeat(self._times[:, None], n_cubes, axis=1)
-        self._memories = LowPass(time, n_pads)
-        self._amplitude = np.zeros_like(self._memories.lag)
-        for cube, model in enumerate(self._models):
-            if model is None:
-                continue
-            places = np.searchsorted(self._times, model.time)
-            self._amplitude[places, : model.n_pads, cube] = model.amplitude.T
+        self._memories = LowPass(time, self._amplitude)
+        self.offset, self.slope, self.gain = self._memories.sums
         self._total = self._amplitude.sum(axis=0)
-        # Errors of the amplitudes by independent causes (C, causes, P, K).
-        stated = [model.deviation for model in self._models if model is not None]
-        n_causes = max((len(one) for one in stated if one is not None), default=0)
-        self._amplitude_errors = np.zeros((n_cubes, n_causes, n_pads, len(self._times)))
-        for cube, model in enumerate(self._models):
-            if model is not None and model.deviation is not None:
-                places = np.searchsorted(self._times, model.time)
-                own = self._amplitude_errors[cube, : len(model.deviation), : model.n_pads]
-                own[:, :, places] = model.deviation
         self._stiffness = pipeline.stiffness
         self._rest = pipeline.rest_frequency
         self._rest_version = pipeline.rest_changes
 
-        shape = n_pads, n_cubes
         # Time stamp, in ns, and readings of the newest row of each cube at the last step.
         self._time_ns = np.zeros(n_cubes, np.int64)
         self._reading = np.zeros(shape)
@@ -112,10 +112,6 @@ class Creep:
         # Largest reading of each pad that loads that were not measured are assumed to have caused.
         self._largest_unknown = np.zeros(shape)
         self._is_certain = np.ones(n_cubes, bool)
-        self.offset = np.zeros(shape)
-        self.slope = np.zeros(shape)
-        self.gain = np.zeros(shape)
-        self._set_duration(np.ones(n_cubes))
 
     @property
     def is_known(self) -> Mask:
@@ -126,32 +122,30 @@ class Creep:
         """Advance the low-pass filters of the readings to the newest row of each cube.
 
         Args:
-            thermal: Effect of temperature (P, C), stress / stiffness, which the readings contain.
+            thermal: Effect of temperature (C, P), stress / stiffness, which the readings contain.
             end_ns: Newest time stamp of the scan that is processed next, in ns.
         """
         elapsed_ns, is_lost, is_gap = self._find_gaps()
-        newest = np.array(self._newest.reading.T, float, order="C")
+        newest: Array = self._newest.reading - thermal
         # The newest reading of a pad that is not used is NaN. The earlier one is kept instead.
-        is_unused = np.isnan(newest)
-        now = np.where(is_unused, self._reading, newest - thermal)
-        change = now - self._reading
-        share = self._memories.advance(elapsed_ns * 1e-9, change)
+        now = np.where(np.isnan(newest), self._reading, newest)
+        newest_ns = self._newest.newest_ns
+        ahead_s = np.maximum(end_ns - newest_ns, STEP_NS) * 1e-9
+        # A cube without any row so far has no earlier reading from which its first one differs.
+        ahead_s[newest_ns == 0] = np.inf
+        share = self._memories.advance(elapsed_ns * 1e-9, self._reading, now, ahead_s)
         # Over the interval, each filter replaces this share of its output by the readings of the
         # interval. The unknown fraction of these readings is 0 or, in a gap, 1.
         self._unknown += share * (is_gap - self._unknown)
-        self._unknown[:, is_lost] = 1.0
         if is_gap.any():
-            before = np.abs(self._reading)
-            larger = np.maximum(before, np.abs(now))
+            self._unknown[:, is_lost] = 1
+            larger = np.maximum(np.abs(self._reading), np.abs(now))
             largest = self._largest_unknown
-            np.maximum(largest, larger, out=largest, where=is_gap)
+            np.maximum(largest, larger, out=largest, where=is_gap[:, None])
             self._is_certain[is_gap] = False
-        self._time_ns[:] = self._newest.newest_ns
+        self._time_ns[:] = newest_ns
         self._reading[:] = now
         self._update_certainty()
-        ahead_ns = end_ns - self._time_ns
-        duration_ns = np.maximum(ahead_ns, STEP_NS)
-        self._set_line(duration_ns * 1e-9)
 
     def _find_gaps(self) -> tuple[Times, Mask, Mask]:
         """Return the interval from each cube's newest row at the last step to its newest row now.
@@ -168,65 +162,24 @@ class Creep:
         elapsed_ns[is_lost] = 0
         return elapsed_ns, is_lost, is_gap
 
-    def _set_line(self, duration_s: Array) -> None:
-        """Compute `offset`, `slope` and `gain`, which state creep as a linear function of time.
-
-        The function is exact at the end of the duration, if readings change linearly until then.
-
-        Args:
-            duration_s: Time from the newest row of each cube to the end of the step (C,), in s.
-        """
-        # The durations of successive steps are usually equal.
-        if not np.array_equal(duration_s, self._duration_s):
-            self._set_duration(duration_s)
-        self.offset[:] = self._total * self._reading
-        self.slope[:] = 0
-        for k, amplitude in enumerate(self._amplitude):
-            lagging = amplitude * self._memories.lag[k]
-            self.offset -= lagging
-            lagging *= self._of_lag[k]
-            self.slope += lagging
-        self.gain[:] = self._full_gain
-        # A cube without any row so far has no earlier reading from which its first one differs.
-        self.gain[:, self._time_ns == 0] = 0
-        self.slope -= self.gain * self._reading
-
-    def _set_duration(self, duration_s: Array) -> None:
-        """Compute the factors in `slope` and `gain` that depend only on the duration of the step.
-
-        Args:
-            duration_s: Time from the newest row of each cube to the end of the step (C,), in s.
-        """
-        self._duration_s = duration_s
-        share, mean = self._memories.find_shares(duration_s)
-        # The low-passed reading changes, per second, by one fraction of its lag behind the reading
-        # and by another fraction of the change of the reading.
-        self._of_lag = share / duration_s
-        of_change = (1 - mean) / duration_s
-        self._full_gain = np.zeros_like(self.gain)
-        for k, amplitude in enumerate(self._amplitude):
-            self._full_gain += amplitude * of_change[k]
-
     def errors(self, cubes: Index) -> Array:
         """Return the errors (n, P, k) of the computed creep of n cubes, in Pa.
 
         The k independent causes are unknown earlier loads and errors of the law of creep. Each
         column has the size of one standard deviation.
         """
+        reading = self._reading[cubes]
         stiffness = self._stiffness[cubes]
-        unknown = self._find_unknown(cubes)
         _, _, is_gap = self._find_gaps()
         # If a cube had a gap without rows before its newest row, the filters have not been advanced
         # over it yet. Until they are, the whole of the creep counts as unknown.
         newest = np.nan_to_num(self._newest.reading[cubes])
-        before = np.abs(self._reading.T[cubes])
-        larger = np.maximum(before, np.abs(newest))
-        largest = self._total.T[cubes] * larger * stiffness
-        unknown = np.where(is_gap[cubes, None], largest * UNIFORM_DEVIATION, unknown)
-        memory = (self._reading - self._memories.lag).T[cubes]
-        by_law = np.einsum("nspk,npk->nps", self._amplitude_errors[cubes], memory)
-        errors = np.dstack([unknown, by_law * stiffness[:, :, None]])
-        return np.asarray(errors)
+        larger = np.maximum(np.abs(reading), np.abs(newest))
+        largest = self._total[cubes] * larger * stiffness * UNIFORM_DEVIATION
+        unknown = np.where(is_gap[cubes, None], largest, self._find_unknown(cubes))
+        memory = reading - self._memories.lag[:, cubes]
+        by_law = (self._amplitude_errors[:, :, cubes] * memory).sum(axis=1) * stiffness
+        return np.stack([unknown, *by_law], axis=2)
 
     def _update_certainty(self) -> None:
         """Mark the creep of a cube as certain again if the error by unknown loads is small enough.
@@ -247,10 +200,9 @@ class Creep:
         Args:
             cube: Numbers of cubes (n,).
         """
-        amplitude = self._amplitude.T[cube].swapaxes(1, 2)
-        share = multiply(self._unknown.T[cube], amplitude)
-        largest = share * self._largest_unknown.T[cube]
-        largest = largest * self._stiffness[cube]
+        amplitude = self._amplitude[:, cube].swapaxes(0, 1)
+        share = multiply(self._unknown[:, cube].T, amplitude)
+        largest = share * self._largest_unknown[cube] * self._stiffness[cube]
         deviation: Array = largest * UNIFORM_DEVIATION
         return deviation
 
@@ -262,8 +214,7 @@ class Creep:
         tare divides what it measures by the fraction, in order to correct the whole error.
         """
         known = 1 - self._unknown
-        creeping = known[:, None] * self._amplitude
-        visible: Array = 1 - creeping.sum(axis=0).T
+        visible: Array = 1 - (known[..., None] * self._amplitude).sum(axis=0)
         return visible
 
     def follow_rest(self) -> bool:
@@ -278,17 +229,16 @@ class Creep:
         pipeline = self._pipeline
         if self._rest_version == pipeline.rest_changes:
             return False
-        shift = np.nan_to_num(pipeline.shift_of_zero(self._rest)).T
+        shift = np.nan_to_num(pipeline.shift_of_zero(self._rest))
         self._rest[:] = pipeline.rest_frequency
         self._rest_version = pipeline.rest_changes
         self._reading -= shift
-        self._newest.reading[:] -= shift.T
+        self._newest.reading[:] -= shift
         # The known fraction of a low-passed reading shifts with the readings. So the lag, reading
         # minus low-passed reading, changes by the unknown fraction of the shift.
-        self._memories.lag -= self._unknown[:, None] * shift
-        size = np.abs(self._reading)
+        self._memories.lag -= self._unknown[..., None] * shift
         largest = self._largest_unknown
-        np.minimum(largest, size, out=largest, where=shift != 0)
+        np.minimum(largest, np.abs(self._reading), out=largest, where=shift != 0)
         return bool(shift.any())
 
     def parts(self) -> list[Array]:
@@ -297,13 +247,13 @@ class Creep:
             self._newest.reading,
             self._time_ns.view(float),
             self._rest,
-            self._reading.T,
+            self._reading,
             self._unknown,
-            self._largest_unknown.T,
-            self._memories.lag.swapaxes(1, 2),
-            self.offset.T,
-            self.slope.T,
-            self.gain.T,
+            self._largest_unknown,
+            self._memories.lag,
+            self.offset,
+            self.slope,
+            self.gain,
         ]
 
     def resume(self) -> None:

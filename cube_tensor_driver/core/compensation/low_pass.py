@@ -20,6 +20,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import Array, Real
+from ..kernel import run as kernel
 from ..kernel.contract import MAX_GAP_NS
 
 STEP_NS = 100_000_000
@@ -68,64 +69,85 @@ def relaxed_share(ratio: Array) -> Array:
     return share
 
 
-class LowPass:
-    """K low-pass filters for each of C cubes, each of which filters P signals.
+def find_shares(ratio: Array) -> tuple[Array, Array]:
+    """Return m = 1 - exp(-ratio), and m / ratio, which is 1 for the ratio 0.
 
-    The cubes are the last axis of all arrays, because numpy is fastest along it.
+    Args:
+        ratio: Length of an interval divided by the time constant of a filter, from 0 on.
+    """
+    share = relaxed_share(ratio)
+    divisor = np.maximum(ratio, 1e-300)
+    return share, np.where(ratio > 0, share / divisor, 1.0)
+
+
+class LowPass:
+    """K low-pass filters of each of P signals of C cubes, and weighted sums over the K filters.
 
     Attributes:
-        lag: How far the outputs of the filters lag behind the inputs (K, P, C).
+        lag: How far the outputs of the filters lag behind the inputs (K, C, P).
+        sums: The following three (3, C, P).
+        output: Sum of weight × output over the filters (C, P). At the time t after the interval
+            with which `advance` was called, it is output + (slope + gain u) t, if the input is u
+            then, and was a straight line until then.
+        slope: Factor of t (C, P), per second.
+        gain: Factor of u t (C, P), per second.
     """
 
-    def __init__(self, time: Array, n_signals: int) -> None:
+    def __init__(self, time: Array, weight: Array) -> None:
         """Begin with outputs that equal the inputs.
 
         Args:
             time: Time constants (K, C), in s.
-            n_signals: Number P of signals.
+            weight: Weights in the sums (K, C, P).
         """
-        self._time = time
-        # Whether a cube has other time constants than the cube with the number before.
-        is_different = time[:, 1:] != time[:, :-1]
-        self._is_other = is_different.any(axis=0)
-        n_times, n_cubes = time.shape
-        self.lag = np.zeros((n_times, n_signals, n_cubes))
+        self._constants = time, weight
+        self.lag = np.zeros_like(weight)
+        self._share = np.zeros_like(time)
+        self.sums = np.zeros((3, *weight.shape[1:]))
+        self.output, self.slope, self.gain = self.sums
 
-    def advance(self, elapsed_s: Real, change: Real) -> Array:
-        """Advance the filters by one interval for each cube.
+    def advance(self, elapsed_s: Real, before: Array, now: Array, ahead_s: Real) -> Array:
+        """Advance the filters by one interval for each cube, and compute the sums.
 
         Args:
-            elapsed_s: Lengths of the intervals (C,), in s; 0 leaves the outputs unchanged.
-            change: Changes of the inputs (P, C), along straight lines.
+            elapsed_s: Lengths of the intervals (C,), in s; 0 leaves the lags unchanged.
+            before: Inputs at the begin of the interval (C, P).
+            now: Inputs at its end (C, P); in between, they are straight lines.
+            ahead_s: Time after the interval (C,), in s, for which the sums are exact. They are
+                approximations for other times, and constant if it is infinite.
 
         Returns:
             Fraction m = 1 - exp(-elapsed_s / time) of each output that the interval replaced, as an
-            array (K, C).
+            array (K, C), which the next call overwrites.
         """
-        share, mean = self.find_shares(elapsed_s)
-        kept = 1 - share
-        for k, lag in enumerate(self.lag):
-            lag *= kept[k]
-            lag += mean[k] * change
-        return share
+        advance = _advance if kernel.native is None else kernel.native.filter
+        given = elapsed_s, before, now, ahead_s
+        advance(*self._constants, *given, self.lag, self._share, self.sums)
+        return self._share
 
-    def find_shares(self, elapsed_s: Real) -> tuple[Array, Array]:
-        """Return m = 1 - exp(-ratio) and m / ratio, both (K, C).
 
-        The ratio is the length of an interval divided by the time constant of a filter.
-
-        Args:
-            elapsed_s: Lengths of the intervals (C,), in s.
-        """
-        # The cubes of one hub follow each other and have equal intervals, so one computation serves
-        # them all.
-        is_other = self._is_other | (elapsed_s[1:] != elapsed_s[:-1])
-        begins_run = np.append(True, is_other)
-        begins = np.flatnonzero(begins_run)
-        ratio = elapsed_s[begins] / self._time[:, begins]
-        share = relaxed_share(ratio)
-        # The quotient share / ratio tends to 1 as the length of the interval tends to 0.
-        divisor = np.maximum(ratio, 1e-300)
-        mean = np.where(ratio > 0, share / divisor, 1.0)
-        run = np.cumsum(begins_run) - 1
-        return share.take(run, axis=1), mean.take(run, axis=1)
+def _advance(
+    time: Array,
+    weight: Array,
+    elapsed_s: Real,
+    before: Array,
+    now: Array,
+    ahead_s: Real,
+    lag: Array,
+    share: Array,
+    sums: Array,
+) -> None:
+    """Advance filters; it specifies the function in C. The arguments are those of `LowPass`."""
+    output, slope, gain = sums
+    sums[:] = 0
+    for k, lag_k in enumerate(lag):
+        share[k], mean = find_shares(elapsed_s / time[k])
+        ahead_share, ahead_mean = find_shares(ahead_s / time[k])
+        of_lag = ahead_share / ahead_s
+        of_change = (1 - ahead_mean) / ahead_s
+        lag_k *= (1 - share[k])[:, None]
+        lag_k += mean[:, None] * (now - before)
+        output += weight[k] * (now - lag_k)
+        slope += weight[k] * lag_k * of_lag[:, None]
+        gain += weight[k] * of_change[:, None]
+    slope -= gain * now

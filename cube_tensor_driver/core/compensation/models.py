@@ -9,7 +9,7 @@ for each cube. Those that `ThermalModel` states include the gains.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from typing import ClassVar, TypeVar
 
@@ -93,6 +93,32 @@ class EffectModel:
 
 
 _Model = TypeVar("_Model", bound=EffectModel)
+
+
+def tabulate(
+    models: Sequence[EffectModel | None],
+    name: str,
+    n_pads: int,
+    width: int = 0,
+) -> Array:
+    """Return an attribute (pads, k) of the models of C cubes as a table (C, n_pads, largest k).
+
+    It is 0 where a cube has no such model, pad or column.
+
+    Args:
+        models: Models of the cubes.
+        name: Name of the attribute.
+        n_pads: Largest number of pads of a cube.
+        width: Smallest number of columns of the table.
+    """
+    values = {cube: getattr(model, name, None) for cube, model in enumerate(models)}
+    stated = {cube: value for cube, value in values.items() if value is not None}
+    width = max([width, *(value.shape[1] for value in stated.values())])
+    table = np.zeros((len(models), n_pads, width))
+    for cube, value in stated.items():
+        pads, columns = value.shape
+        table[cube, :pads, :columns] = value
+    return table
 
 
 @dataclass(frozen=True, eq=False)

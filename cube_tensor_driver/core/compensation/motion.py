@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Single, Times, multiply
+from ..arrays import AnyArray, Array, Single, Times, multiply
 from ..kernel import run as kernel
 from ..poses import CubePoses
 from ..rows import FrequencyRows
@@ -38,21 +38,15 @@ class Motion(NamedTuple):
     Attributes:
         time_ns: The instants (K,), in ns on the clock of the rows, in rising order. If there are
             none (K = 0), the motion is unknown; a single one holds at all times.
-        specific_force: Specific force at the origin of the frame (K, 3), in m/s².
-        gradient: Derivatives of the components of the specific force with respect to position
-            (K, 3, 3), in 1/s².
+        state: Specific force at the origin of the frame, in m/s², then the three rows of G, the
+            derivatives of each of its components with respect to position, in 1/s² (K, 4, 3).
     """
 
     time_ns: Times
-    specific_force: Array
-    gradient: Array
+    state: Array
 
 
-UNKNOWN_MOTION = Motion(
-    time_ns=np.zeros(0, np.int64),
-    specific_force=np.zeros((0, 3)),
-    gradient=np.zeros((0, 3, 3)),
-)
+UNKNOWN_MOTION = Motion(np.zeros(0, np.int64), np.zeros((0, 4, 3)))
 """Motion of a skin of which nothing is known."""
 
 
@@ -60,7 +54,7 @@ class ForcesAtCubes:
     """Computes the specific forces at the cubes of one skin, with the same bits on every processor.
 
     The specific force is what an accelerometer at the cube measures: acceleration minus gravity.
-    The function `_interpolate` and the method `_find_forces` specify what the function in C does.
+    The function `_find_forces` specifies what the function in C does.
     """
 
     def __init__(self, poses: CubePoses) -> None:
@@ -70,9 +64,7 @@ class ForcesAtCubes:
             poses: Poses in the parent frame of the skin. The forces of a recording are reproduced
                 bit for bit only with the poses of its SkinInfo message.
         """
-        # The specific force at the origin is multiplied by 1, its derivatives by the coordinates.
-        position = np.insert(poses.position, 0, 1, axis=1)
-        self._position = np.ascontiguousarray(position, np.float32)
+        self._position = np.ascontiguousarray(poses.position, np.float32)
         self._rotation = np.ascontiguousarray(poses.rotation, np.float32)
 
     def add_to(self, rows: FrequencyRows, motion: Motion) -> FrequencyRows:
@@ -82,45 +74,53 @@ class ForcesAtCubes:
             rows: N rows of frequencies (samples of cubes); those of unknown cubes get NaN.
             motion: Motion of the skin, at instants near the times of the rows.
         """
-        # Specific force at the origin, and its derivatives along x, y and z (K, 4, 3).
-        known = np.empty((len(motion.time_ns), 4, 3))
-        known[:, 0] = motion.specific_force
-        known[:, 1:] = motion.gradient.swapaxes(1, 2)
-        columns = rows.columns()
-        if kernel.native is None or rows.cube.dtype != np.uint16:
-            force = self._find_forces(rows, motion.time_ns, known)
-        else:
-            force = np.empty((len(rows), 3), np.float32)
-            cube = np.ascontiguousarray(rows.cube)
-            stamp_ns = np.ascontiguousarray(rows.stamp_ns, np.int64)
-            poses = self._position, self._rotation
-            kernel.native.forces(motion.time_ns, known, *poses, cube, stamp_ns, force)
-        columns["specific_force"] = force
-        return FrequencyRows(**columns)
+        is_native = kernel.native is not None and rows.cube.dtype == np.uint16
+        find_forces = kernel.native.forces if is_native else _find_forces
+        cube = np.ascontiguousarray(rows.cube)
+        stamp_ns = np.ascontiguousarray(rows.stamp_ns, np.int64)
+        force = np.empty((len(rows), 3), np.float32)
+        find_forces(*motion, self._position, self._rotation, cube, stamp_ns, force)
+        # This takes a third of the time of `dataclasses.replace`.
+        return FrequencyRows(
+            rows.cube,
+            rows.sequence,
+            rows.stamp_ns,
+            rows.frequency,
+            rows.temperature,
+            rows.pad_fault,
+            rows.status,
+            force,
+        )
 
-    def _find_forces(
-        self,
-        rows: FrequencyRows,
-        time_ns: Times,
-        known: Array,
-    ) -> Single:
-        """Return the specific forces (N, 3) of rows in the frames of their cubes; NaN: unknown.
 
-        Args:
-            rows: N rows of frequencies.
-            time_ns: Instants (K,) at which the motion is known, in ns.
-            known: Specific force at the origin, in m/s², and its derivatives along x, y and z, in
-                1/s², at the instants (K, 4, 3).
-        """
-        n_cubes = len(self._position)
-        cube = rows.cube.clip(0, n_cubes - 1).astype(np.intp)
-        state = _interpolate(time_ns, known, rows.stamp_ns)
-        in_parent = multiply(self._position[cube], state.astype(np.float32))
-        # A vector in the parent frame is transformed to the frame of a cube by the transpose of the
-        # rotation of the cube.
-        in_cube: Single = multiply(in_parent, self._rotation[cube])
-        in_cube[rows.cube != cube] = np.nan
-        return in_cube
+def _find_forces(
+    time_ns: Times,
+    known: Array,
+    position: Single,
+    rotation: Single,
+    cube: AnyArray,
+    stamp_ns: Times,
+    force: Single,
+) -> None:
+    """Compute the specific forces at N rows in the frames of their cubes; NaN: unknown.
+
+    Args:
+        time_ns: Instants (K,), in ns.
+        known: Motion at the instants (K, 4, 3), the `state` of a `Motion`.
+        position, rotation: Poses of the cubes, (C, 3) and (C, 3, 3).
+        cube: Numbers of the cubes (N,).
+        stamp_ns: Time stamps (N,), in ns.
+        force: Array for the forces (N, 3), in m/s².
+    """
+    number = cube.clip(0, len(position) - 1).astype(np.intp)
+    state = _interpolate(time_ns, known, stamp_ns).astype(np.float32)
+    in_parent = state[:, 0]
+    for axis in range(3):
+        in_parent += state[:, 1:, axis] * position[number, axis, None]
+    # A vector in the parent frame is transformed to the frame of a cube by the transpose of the
+    # rotation of the cube.
+    force[:] = multiply(in_parent, rotation[number])
+    force[cube != number] = np.nan
 
 
 def _interpolate(time_ns: Times, known: Array, stamp_ns: Times) -> Array:

@@ -14,16 +14,14 @@ the skin, P the largest number of pads of a cube.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from ..arrays import Array, Index, index_cubes
+from ..arrays import Array, Index, Real, index_cubes
 from ..kernel.contract import Columns
 from ..pipeline import Pipeline
 from ..status import THERMAL
 from .low_pass import MAX_STEP_NS, LowPass
-from .models import ThermalModel
+from .models import tabulate
 
 START_KELVIN = 1.0
 """Standard deviation, in K, of the difference between elastomer and thermometer at the first row.
@@ -52,7 +50,7 @@ class Thermal:
     Attributes:
         has_model: Whether the calibration of a cube has a model of this effect (C,).
         is_known: Whether the standard deviation of the effect is at most `MAX_DEVIATION` (C,).
-        offset: The effect on each pad now (P, C), stress / stiffness.
+        offset: The effect on each pad now (C, P), stress / stiffness.
     """
 
     key = "thermal"
@@ -64,63 +62,41 @@ class Thermal:
         Args:
             pipeline: Pipeline with the calibrations and the pads' stiffness.
         """
-        self._models = [calibration.thermal for calibration in pipeline.calibrations]
-        self.has_model = np.array([model is not None for model in self._models])
-        present = [model for model in self._models if model is not None]
-        n_lags = max((len(model.lag) for model in present), default=0)
-        n_degrees = max((model.coefficient.shape[1] for model in present), default=0)
-        has_stiffness = pipeline.stiffness > 0
-        stiffness = np.where(has_stiffness, pipeline.stiffness, np.inf).T
-        n = len(self._models)
-        times = np.full((n_lags, n), MIN_LAG_S)
-        self._reference = np.zeros(n)
-        self._weight = np.zeros((n_lags, n))
-        self._coefficient = np.zeros((n_degrees, *stiffness.shape))
-        # Effect of the elastomer's temperature on the stress of a pad, in Pa/K, as the root mean
-        # square over the pads of a cube.
-        self._slope = np.zeros(n)
-        # Standard deviation of the stress of a pad, in Pa per K by which the elastomer lags behind
-        # the thermometer, as the root mean square over the pads of a cube.
-        self._ramp = np.zeros(n)
-        for number, model in enumerate(self._models):
-            if model is None:
-                continue
-            lag = np.maximum(model.lag, MIN_LAG_S)
-            filters = slice(len(lag))
-            times[filters, number] = lag
-            self._weight[filters, number] = filter_weights(lag)
-            self._reference[number] = model.reference
-            pads, degrees = model.coefficient.shape
-            self._coefficient[:degrees, :pads, number] = model.coefficient.T
-            self._slope[number] = _find_typical_size(model.coefficient[:, :1])
-            if model.ramp is not None:
-                self._ramp[number] = _find_typical_size(model.ramp)
-        # Errors (C, P, k) of the stresses, in Pa per K (or power of K), by the attribute of the
-        # model that states them.
-        ramps = [model.ramp for model in present if model.ramp is not None]
-        n_ramps = max((ramp.shape[1] for ramp in ramps), default=0)
-        widths = {"coefficient": 1, "ramp": n_ramps, "deviation": n_degrees}
-        self._error_sizes = {
-            name: _stack(self._models, name, (len(stiffness), width))
-            for name, width in widths.items()
-        }
-        self._coefficient /= stiffness
-        self._filters = LowPass(times, n_signals=1)
+        models = [calibration.thermal for calibration in pipeline.calibrations]
+        self.has_model = np.array([model is not None for model in models])
+        lags = {cube: model.lag for cube, model in enumerate(models) if model is not None}
+        n_lags = max(map(len, lags.values()), default=0)
+        n_cubes = len(models)
+        times = np.full((n_lags, n_cubes), MIN_LAG_S)
+        weight = np.zeros((n_lags, n_cubes, 1))
+        for cube, lag in lags.items():
+            times[: len(lag), cube] = np.maximum(lag, MIN_LAG_S)
+            weight[: len(lag), cube, 0] = filter_weights(times[: len(lag), cube])
+        self._reference = np.array([0 if model is None else model.reference for model in models])
+        # Stresses of the pads, and their errors by independent causes (C, P, k), in Pa per K or
+        # power of K.
+        self._coefficient, self._deviation, self._ramp = (
+            tabulate(models, name, pipeline.n_pads) for name in ("coefficient", "deviation", "ramp")
+        )
+        n_pads = np.array([calibration.layout.n_pads for calibration in pipeline.calibrations])
+        # Sizes of the linear effect and of `_ramp`, as root mean squares over the pads of a cube.
+        linear = self._coefficient[..., :1]
+        self._linear_size, self._ramp_size = (
+            np.sqrt((values**2).sum(axis=(1, 2)) / n_pads) for values in (linear, self._ramp)
+        )
+        # For a pad that the cube does not have, quotients are 0.
+        self._stiffness = np.where(pipeline.stiffness > 0, pipeline.stiffness, np.inf)
+        self._filters = LowPass(times, weight)
 
         # Time stamp of each cube's row in the last step, in ns, and the last measured temperature,
         # in °C.
-        self._time_ns = np.zeros(n, np.int64)
-        self._measured = np.full(n, np.nan)
+        self._time_ns = np.zeros(n_cubes, np.int64)
+        self._measured = np.full(n_cubes, np.nan)
         # Standard deviation of the elastomer's temperature, in K, because temperatures before the
         # first row or in a gap are unknown.
-        self._unknown = np.full(n, START_KELVIN)
-
-        # Temperature of the elastomer minus the reference temperature, in K.
-        self._level = np.zeros(n)
-        # Measured temperature minus that of the elastomer, in K.
-        self._lag = np.full(n, np.nan)
-        self.offset = np.zeros(stiffness.shape)
-        self.is_known = np.zeros(n, bool)
+        self._unknown = np.full(n_cubes, START_KELVIN)
+        self.offset = np.zeros(self._stiffness.shape)
+        self.is_known = np.zeros(n_cubes, bool)
 
     def advance(self, scan: Columns) -> None:
         """Advance the temperatures of the elastomer to the time stamps of a scan's rows.
@@ -128,51 +104,57 @@ class Thermal:
         Args:
             scan: Rows of one scan, with time stamps and measured temperatures.
         """
-        n = len(self._models)
-        cube = index_cubes(scan.cube, n)
+        cube = index_cubes(scan.cube, len(self.has_model))
         time_ns = self._time_ns.copy()
         time_ns[cube] = scan.stamp_ns
-        given = self._measured.copy()
+        given = np.full_like(self._measured, np.nan)
         given[cube] = scan.temperature
         is_missing = np.isnan(given)
-        is_first = np.isnan(self._measured) & ~is_missing
-        # If a time stamp precedes the last one, no time counts as elapsed. The first temperature
-        # measured at a cube is taken as the temperature of its elastomer, too.
+        is_first = np.isnan(self._measured)
+        measured = np.where(is_missing, self._measured, given)
+        # The first temperature measured at a cube is taken as that of its elastomer, too.
+        before = np.where(is_first, measured, self._measured)
+        # If a time stamp precedes the last one, no time counts as elapsed.
         elapsed_ns = np.maximum(time_ns - self._time_ns, 0)
-        elapsed_ns[is_first] = 0
-        change = given - self._measured
-        change[is_missing | is_first] = 0
-        elapsed_s = elapsed_ns * 1e-9
-        share = self._filters.advance(elapsed_s, change[None])
+        elapsed_ns[is_first & ~is_missing] = 0
+        share = self._filter(elapsed_ns * 1e-9, before, measured)
         # The deviation decays like the slowest filter of the cube.
         decay = 1 - share.min(axis=0, initial=1.0)
         is_gap = elapsed_ns > MAX_STEP_NS
         final = np.where(is_missing | is_gap, LOST_KELVIN, 0)
         self._unknown *= decay
         self._unknown += final * (1 - decay)
-        self._measured[~is_missing] = given[~is_missing]
+        self._measured[:] = measured
         self._time_ns[:] = time_ns
-        self.resume()
+        self._update()
 
     def resume(self) -> None:
-        """Compute `offset` and `is_known` from the state, which may be one from a recording."""
-        # NaN as long as no temperature has been measured.
-        lag = 0 * self._measured
-        for number, weight in enumerate(self._weight):
-            lag += weight * self._filters.lag[number, 0]
-        self._lag[:] = lag
-        level = self._measured - lag - self._reference
-        self._level[:] = np.nan_to_num(level)
-        self.offset[:] = 0
-        for coefficient in self._coefficient[::-1]:
-            self.offset += coefficient
-            self.offset *= self._level
+        """Continue from a recorded state that was written into the arrays of `parts`."""
+        nothing = np.zeros(len(self.has_model))
+        self._filter(nothing, self._measured, self._measured)
+        self._update()
 
-        lag_deviation = self._ramp * abs(self._lag)
-        start_deviation = self._slope * self._unknown
+    def _filter(self, elapsed_s: Real, before: Array, now: Array) -> Array:
+        """Advance the filters by intervals (C,), in s, between temperatures (C,), in °C."""
+        # An unknown temperature does not change, so any number may stand for it.
+        first, last = np.nan_to_num([before, now])[..., None]
+        endless = np.full(len(now), np.inf)
+        return self._filters.advance(elapsed_s, first, last, endless)
+
+    def _update(self) -> None:
+        """Compute `offset` and `is_known` from the state."""
+        is_measured = ~np.isnan(self._measured)
+        temperature = self._filters.output[:, 0]
+        level = np.where(is_measured, temperature - self._reference, 0)
+        self.offset[:] = 0
+        for degree in range(self._coefficient.shape[2] - 1, -1, -1):
+            self.offset += self._coefficient[..., degree]
+            self.offset *= level[:, None]
+        self.offset /= self._stiffness
+        behind = np.abs(self._measured - temperature)
+        deviation = self._ramp_size * behind + self._linear_size * self._unknown
         # The comparison is false for NaN, which means that no temperature has been measured so far.
-        is_accurate = lag_deviation + start_deviation <= MAX_DEVIATION
-        self.is_known = self.has_model & is_accurate
+        self.is_known = self.has_model & (deviation <= MAX_DEVIATION)
 
     def errors(self, cubes: Index) -> Array:
         """Return the errors (n, P, k) of the thermal stress on the pads of n cubes, in Pa.
@@ -182,18 +164,18 @@ class Thermal:
         coefficients of the calibration. If no temperature has been measured yet, the reference
         temperature is assumed, with a standard deviation of 5 K.
         """
-        lag = self._lag[cubes]
-        unknown = np.where(np.isnan(lag), LOST_KELVIN, self._unknown[cubes])
-        powers = 1 + np.arange(len(self._coefficient))
-        factors = {
-            "coefficient": unknown[:, None],
-            "ramp": np.nan_to_num(lag)[:, None],
-            "deviation": self._level[cubes][:, None] ** powers,
-        }
-        errors = [
-            self._error_sizes[name][cubes] * factor[:, None] for name, factor in factors.items()
-        ]
-        return np.concatenate(errors, axis=2)
+        temperature = self._filters.output[cubes]
+        behind = self._measured[cubes, None] - temperature
+        is_measured = ~np.isnan(behind)
+        unknown = np.where(is_measured, self._unknown[cubes, None], LOST_KELVIN)
+        level = np.where(is_measured, temperature - self._reference[cubes, None], 0)
+        powers = 1 + np.arange(self._deviation.shape[2])
+        by_cause = (
+            (self._coefficient[..., :1], unknown),
+            (self._ramp, np.nan_to_num(behind)),
+            (self._deviation, level**powers),
+        )
+        return np.concatenate([size[cubes] * by[:, None] for size, by in by_cause], axis=2)
 
     def parts(self) -> list[Array]:
         """Return the arrays of the state. To restore a recorded state, write into them."""
@@ -203,29 +185,6 @@ class Thermal:
             self._unknown,
             self._filters.lag,
         ]
-
-
-def _stack(models: Sequence[ThermalModel | None], name: str, shape: tuple[int, int]) -> Array:
-    """Return an attribute (P, k) of the models of C cubes as (C, P, k); 0 where a model has none.
-
-    Args:
-        models: Models of the cubes.
-        name: Name of the attribute.
-        shape: Numbers P of pads and k of columns; further columns are left out.
-    """
-    stacked = np.zeros((len(models), *shape))
-    for number, model in enumerate(models):
-        value = getattr(model, name, None)
-        if value is not None:
-            part = value[:, : shape[1]]
-            stacked[number, : len(part), : part.shape[1]] = part
-    return stacked
-
-
-def _find_typical_size(values: Array) -> float:
-    """Return the root sum of squares of the K values (P, K) of a pad, as the rms over P pads."""
-    mean_square = (values**2).sum() / len(values)
-    return float(np.sqrt(mean_square))
 
 
 def filter_weights(lag: Array) -> Array:

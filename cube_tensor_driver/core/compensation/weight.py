@@ -11,7 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import Array, Index
+from ..calibration import tabulate_pads
 from ..pipeline import Pipeline
+from .models import tabulate
 
 STANDARD_GRAVITY = 9.80665
 """Standard acceleration of gravity, in m/s² (ISO 80000-3)."""
@@ -22,25 +24,16 @@ class Weight:
 
     Attributes:
         has_model: Whether the calibration of a cube states its response (C,).
-        response: Stress on each pad per specific force (C, 3, P), in Pa per m/s².
+        response: Stress on each pad per specific force (C, P, 3), in Pa per m/s².
     """
 
     def __init__(self, pipeline: Pipeline) -> None:
-        calibrations = pipeline.calibrations
-        shape = len(calibrations), 3, pipeline.n_pads
-        self.response = np.zeros(shape)
-        self._deviation = np.zeros(shape)
-        has_model = [calibration.weight is not None for calibration in calibrations]
-        self.has_model = np.array(has_model)
-        for number, calibration in enumerate(calibrations):
-            model = calibration.weight
-            if model is None:
-                continue
-            gain = calibration.gain
-            pads = slice(len(gain))
-            self.response[number, :, pads] = gain * model.response.T
-            if model.deviation is not None:
-                self._deviation[number, :, pads] = gain * model.deviation.T
+        models = [calibration.weight for calibration in pipeline.calibrations]
+        self.has_model = np.array([model is not None for model in models])
+        n_pads = pipeline.n_pads
+        gain = tabulate_pads(pipeline.calibrations, "gain", n_pads, fill=0)[..., None]
+        self.response = gain * tabulate(models, "response", n_pads, width=3)
+        self._deviation = gain * tabulate(models, "deviation", n_pads, width=3)
 
     def errors(self, cubes: Index, force: Array) -> Array:
         """Return the errors (n, P, 3) of the compensation of weight by independent causes, in Pa.
@@ -52,8 +45,8 @@ class Weight:
             cubes: Numbers of n cubes.
             force: Their newest specific forces (n, 3), in m/s²; NaN: unknown.
         """
-        known = self._deviation[cubes] * force[:, :, None]
+        known = self._deviation[cubes] * force[:, None]
         unknown = self.response[cubes] * STANDARD_GRAVITY
-        is_unknown = np.isnan(force.sum(axis=1, keepdims=True))
-        errors: Array = np.where(is_unknown[:, None], unknown, known).swapaxes(1, 2)
+        is_unknown = np.isnan(force.sum(axis=1))
+        errors: Array = np.where(is_unknown[:, None, None], unknown, known)
         return errors

@@ -18,6 +18,7 @@ from ...core.errors import BagError, CubeError, MessageError
 from ...core.reconstructor import Reconstructor
 from ...core.rows import FrequencyRows
 from ...messages.codec import SECOND, frequency_codec
+from ...messages.compensation import encode_compensation
 from ...messages.skin_info import read_cube_poses
 from ...msg import SkinCompensation, SkinFrequencies, SkinInfo
 from ..callbacks import LOG_PERIOD_S
@@ -31,7 +32,6 @@ from ..diagnostics.updater import Diagnostics
 from ..messages import (
     CheckedSubscription,
     log_refused_message,
-    make_compensation_message,
     make_info_message,
 )
 from ..motion import MissingMotion, make_motion_source
@@ -249,9 +249,8 @@ class Reconstruction(CubeNode):
             motion = self._recorded.compensation_at(stamp_ns, self._reconstructor)
         elif self._motion:
             try:
-                first_ns = int(rows.stamp_ns.min(initial=stamp_ns))
                 last_ns = int(rows.stamp_ns.max(initial=stamp_ns))
-                motion = self._motion.motion(first_ns, last_ns)
+                motion = self._motion.motion(stamp_ns, last_ns)
             except MissingMotion as error:
                 motion = UNKNOWN_MOTION
                 problem = f"weight is not compensated: {error}"
@@ -265,8 +264,8 @@ class Reconstruction(CubeNode):
                 states = compensation.states()
             if motion is not None or states:
                 frame_id = self._skin.parent_frame
-                message = make_compensation_message(frame_id, stamp_ns, motion, states)
-                self._compensation.publish(message)
+                data = encode_compensation(frame_id, stamp_ns, motion, states)
+                self._compensation.publish(data)
         return rows if motion is None else self._forces.add_to(rows, motion)
 
     def _refuse(self, error: CubeError) -> None:
