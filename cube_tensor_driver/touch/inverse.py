@@ -271,7 +271,7 @@ class SurfaceInverse:
         """
         return np.asarray(values)[:, self.columns] * self._unit_factors
 
-    def unroll(self, centre: int, cubes: Index) -> tuple[Array, Array]:
+    def unroll(self, centre: int, cubes: Index | slice) -> tuple[Array, Array]:
         """Lay cubes of a bent skin flat around one cube, from which they keep their distance.
 
         Args:
@@ -343,6 +343,10 @@ class SurfaceInverse:
         result = self._windows.product(y).astype(np.float64)
         rows = result.reshape(len(self.points), -1)
         return TractionField(rows[:, :3], rows[:, 3])
+
+    def depth_pressure_of_scaled(self, scaled: Array) -> Array:
+        """Return only `TractionField.depth_pressure` (M,) of `field_of_scaled`, which is faster."""
+        return self._windows.product(self._fill(scaled), only_pressure=True).ravel().astype(float)
 
     def deviation(self, values: Array) -> FieldDeviation:
         """Compute the standard deviations of the traction field that `field` returns.

@@ -198,7 +198,9 @@ class WindowPosteriors:
         is_single = counts[self.kind] == 1
         self._single = np.flatnonzero(is_single)
         single_kinds = self.kind[self._single]
-        self._single_gain = self.gain[single_kinds]
+        by_point = self.gain.reshape(len(self.gain), len(points), ROWS_PER_POINT, -1)
+        pressure_gain = np.ascontiguousarray(by_point[:, :, -1])
+        self._gains = [(gain, gain[single_kinds]) for gain in (self.gain, pressure_gain)]
 
     def _find_kinds(
         self,
@@ -239,29 +241,30 @@ class WindowPosteriors:
         ]
         return _number_distinct(np.concatenate(features, axis=1))
 
-    def product(self, y: Single) -> Single:
+    def product(self, y: Single, only_pressure: bool = False) -> Single:
         """Compute the posterior mean G y (head of this file) of the traction around all cubes.
 
         Args:
             y: Components (cubes, C) that the cubes measure, in Pa; 0 where unknown.
+            only_pressure: Whether only the pressure at the cubes' depth is computed, which takes a
+                third of the time.
 
         Returns:
             Posterior mean (cubes, points x ROWS_PER_POINT) in Pa, at the surface points around each
             cube. Each point has `ROWS_PER_POINT` results: traction along x, y and z, and pressure
-            at the cubes' depth.
+            at the cubes' depth. (cubes, points) if `only_pressure`.
         """
         # The values of all cubes of a window are joined to one row, in the order of the columns of
         # the gain matrix G.
         n = len(self.near)
-        gathered = y[self.near].reshape(n, -1)
-        n_rows = self.gain.shape[1]
-        result = np.empty((n, n_rows), np.float32)
+        gathered = y.take(self.near, axis=0).reshape(n, -1)
+        gains, single_gains = self._gains[only_pressure]
+        result = np.empty((n, gains.shape[1]), np.float32)
         for kind, rows in self._shared_kinds:
-            gain = self.gain[kind]
-            result[rows] = gathered[rows] @ gain.T
+            result[rows] = gathered[rows] @ gains[kind].T
         if len(self._single):
             single = gathered[self._single]
-            products = self._single_gain @ single[:, :, None]
+            products = single_gains @ single[:, :, None]
             result[self._single] = products[:, :, 0]
         return result
 

@@ -16,7 +16,6 @@ from cube_tensor_driver.core.tensor import rotation_from_rpy
 from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.mechanics.layer import Layer
 from cube_tensor_driver.touch.inverse import SurfaceInverse
-from cube_tensor_driver.touch.tracker import contact_tracker
 from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
 from cube_tensor_driver.touch.tracker.local_values import CubeNoise, LocalValues
 from cube_tensor_driver.touch.tracker.tracked_region import TrackedRegion
@@ -480,29 +479,20 @@ def test_what_a_scan_has_no_time_for_is_done_in_the_next_ones(monkeypatch):
         assert min(np.hypot(*(one.position[:2] - place)) for place in places) < 0.1e-3
 
 
-def test_a_fit_that_waits_for_its_turn_follows_the_pressure_as_coarse(monkeypatch):
-    """Its force changes with the pressure, and the whole change is stated as uncertain."""
+def test_a_fit_of_an_edge_follows_the_load_without_further_work():
+    """Forces are linear in the values as long as the fit stays."""
     bench = TractionBench(Setting(), side=2)
-    values = compute_values_under(
-        bench,
-        bar(24e-3, 2e-3),
-        np.zeros(2),
-        np.array([0.6, -0.6, -3.0]),
-        np.random.default_rng(12),
-    )
+    random, force = np.random.default_rng(12), np.array([0.6, -0.6, -3.0])
+    values = compute_values_under(bench, bar(24e-3, 2e-3), np.zeros(2), force, random)
     tracker = ContactTracker(bench.inverse, LEAST)
     (before,) = tracker.update(values, max_work=np.inf)
-    assert before.refined
-    monkeypatch.setattr(contact_tracker, "MAX_NODE_UPDATES", 0)
-    (waiting,) = tracker.update(1.2 * values, max_work=0)
-    assert not waiting.refined and waiting.id == before.id
-    np.testing.assert_allclose(waiting.force, 1.2 * before.force, rtol=1e-3)
-    assert waiting.moment == pytest.approx(1.2 * before.moment, rel=1e-3)
-    assert waiting.force_uncertainty == pytest.approx(0.2 * 3, rel=0.05)
-    monkeypatch.undo()
     (after,) = tracker.update(1.2 * values, max_work=0)
-    assert after.refined
-    np.testing.assert_allclose(after.force, waiting.force, rtol=5e-3)
+    assert before.refined and after.refined and after.id == before.id
+    np.testing.assert_allclose(after.force, 1.2 * before.force, rtol=1e-3)
+    assert after.moment == pytest.approx(1.2 * before.moment, rel=1e-3)
+    np.testing.assert_allclose(after.position, before.position, atol=1e-6)
+    (last,) = tracker.update(1.2 * values)
+    np.testing.assert_allclose(last.force, after.force, rtol=5e-3)
 
 
 def counted(function, calls):

@@ -23,6 +23,10 @@ _HERTZ_MOMENT = 0.2
 """Second moment of the pressure of a Hertz contact about its centre along one axis, divided by the
 force and the square of the radius: 1/5 for the pressure sqrt(1 - r^2 / a^2)."""
 
+N_MOMENTS = 6
+"""Number of moments of each component of the traction: integrals of the traction times 1, x, y,
+x^2, x y and y^2."""
+
 
 class ContactEstimate(NamedTuple):
     """Estimate of one contact on the flattened skin (skin laid out in the plane z = 0 for the fit).
@@ -93,65 +97,76 @@ def discs_of(estimates: Sequence[ContactEstimate]) -> Discs:
     return Discs(forces, centres, log_squares / 2)
 
 
+def moment_polynomials(places: Array) -> Array:
+    """Return the polynomials (q, `N_MOMENTS`) of positions (q, 2) whose integrals are moments."""
+    x, y = places.T
+    return np.stack([np.ones(len(x)), x, y, x**2, x * y, y**2], axis=1)
+
+
 def estimate_contact(
-    nodes: Array,
-    forces: Array,
+    centre: Array,
+    moments: Array,
     root: Array,
     size: float,
 ) -> ContactEstimate:
-    """Integrate the traction on nodes (small Hertz contacts on a grid) over one contact.
+    """Estimate one contact from the moments of the forces of its nodes (small Hertz contacts).
 
     Args:
-        nodes: Positions (q, 2) of the nodes in m, on the skin laid flat.
-        forces: Forces (3, q) of the nodes along x, y and z, in N.
-        root: Square root R (3, q, n) of their covariance, in N: with its first two axes joined,
-            R R' is the covariance (3 q, 3 q).
+        centre: Position (2,) in m about which the moments are taken.
+        moments: Sums (3, `N_MOMENTS`) of the forces along x, y and z of the nodes, times each of
+            `moment_polynomials`.
+        root: Square root R (3, `N_MOMENTS`, k) of their covariance: with its first two axes joined,
+            R R' is the covariance.
         size: Radius of a node in m.
     """
-    force = forces.sum(axis=1)
+    force = moments[:, 0]
     normal_force = min(float(force[2]), -_MIN_NORMAL_FORCE)
-    place = forces[2] @ nodes / normal_force
-    arm = nodes - place
-    arm_x, arm_y = arm.T
-    moment = arm_x @ forces[1] - arm_y @ forces[0]
-
-    # `slopes` are the derivatives (4, 3, q) of the position (x, y), the moment and the area by the
-    # 3 components of the force of each of q nodes.
-    slopes = np.zeros((4, 3, len(nodes)))
-    slopes[:2, 2] = arm.T / normal_force
-    slopes[2, 0] = -arm_y
-    slopes[2, 1] = arm_x
-    ratio_x, ratio_y = force[:2] / normal_force
-    slopes[2, 2] = ratio_x * arm_y - ratio_y * arm_x
+    x, y = arm = moments[2, 1:3] / normal_force
+    force_x, force_y = force[:2].tolist()
+    moment = moments[1, 1] - x * force_y - moments[0, 2] + y * force_x
 
     # The second moment of the pressure is that of the forces at the nodes, plus that of the Hertz
     # pressure of one node about its own centre. Its eigenvectors are the axes of the ellipse.
     node_moment = _HERTZ_MOMENT * size**2
-    weighted_arm = arm * forces[2][:, None]
-    moment_of_forces = weighted_arm.T @ arm / normal_force
-    second_moment = moment_of_forces + node_moment * np.eye(2)
-    principal_moments, axes = np.linalg.eigh(second_moment)
-    principal_moments = np.maximum(principal_moments, node_moment)
-    mean_moment = float(np.sqrt(principal_moments.prod()))
-    area = np.pi / _HERTZ_MOMENT * mean_moment
-    principal_arm = arm @ axes
-    excess = principal_arm**2 + node_moment - principal_moments
-    relative_excess = (excess / principal_moments).sum(axis=1)
-    slopes[3, 2] = area * relative_excess / (2 * normal_force)
+    xx, xy, yy = moments[2, 3:] / normal_force
+    second_moment = np.array([[xx, xy], [xy, yy]]) - np.outer(arm, arm)
+    eigenvalues, axes = np.linalg.eigh(second_moment)
+    principal_moments = np.maximum(eigenvalues, 0) + node_moment
+    area = float(np.pi / _HERTZ_MOMENT * np.sqrt(principal_moments.prod()))
 
-    propagated_root = np.einsum("kan,anm->km", slopes, root)
+    # `slopes` are the derivatives (4, 3, 6) of the position (x, y), the moment and the area by the
+    # moments of the forces along x, y and z.
+    slopes = np.zeros((4, 3, N_MOMENTS))
+    slopes[0, 2, :2] = -x, 1
+    slopes[1, 2, [0, 2]] = -y, 1
+    slopes[2, 0, [0, 2]] = y, -1
+    slopes[2, 1, :2] = -x, 1
+    slopes[2, 2] = force_x * slopes[1, 2] - force_y * slopes[0, 2]
+    inverse_moment = (axes / principal_moments) @ axes.T
+    (by_xx, by_xy), (_, by_yy) = inverse_moment.tolist()
+    constant = node_moment * (by_xx + by_yy) - 2
+    slopes[3, 2] = [
+        arm @ inverse_moment @ arm + constant,
+        *(-2 * inverse_moment @ arm),
+        by_xx,
+        2 * by_xy,
+        by_yy,
+    ]
+    slopes[3, 2] *= area / 2
+    slopes[:, 2] /= normal_force
+
+    propagated_root = slopes.reshape(4, -1) @ root.reshape(-1, root.shape[2])
     variance = (propagated_root**2).sum(axis=1)
-    force_root = root.sum(axis=1)
+    force_root = root[:, 0]
     smaller_moment, larger_moment = principal_moments
-    aspect = np.sqrt(larger_moment / smaller_moment)
     return ContactEstimate(
         force=force,
         force_covariance=force_root @ force_root.T,
-        place=place,
+        place=centre + arm,
         place_variance=variance[:2],
         moment=float(moment),
         moment_variance=float(variance[2]),
         area=area,
         area_variance=float(variance[3]),
-        aspect=float(aspect),
+        aspect=float(np.sqrt(larger_moment / smaller_moment)),
     )

@@ -8,10 +8,10 @@ fitted to the values of the cubes around it (tracked_region.py): as Hertz contac
 on nodes with a prior that is zero outside the region. Force, position, moment and area follow from
 this fit.
 
-Fits take a few milliseconds, so their number per scan is limited. First fits of Hertz contacts are
-made together, and a Hertz contact that moves only needs one further Gauss-Newton step. If there are
-many fits on nodes, they take turns. A region that has no fit yet is reported with the integrals of
-the field, which are less exact.
+Fits take a few milliseconds, so the work of a scan is limited, and what does not fit is done in the
+next scans. A Hertz contact that moves needs one Gauss-Newton step a scan, and a fit on nodes only a
+product. A region that has no fit yet is reported with the integrals of the field, which are less
+exact.
 """
 
 from __future__ import annotations
@@ -19,21 +19,19 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from ...core.arrays import Array, Index, Mask
 from ..inverse import FieldDeviation, SurfaceInverse, TractionField
 from ..surface import describe_contact
-from .contact_estimate import ContactEstimate, Discs
+from .contact_estimate import ContactEstimate
 from .fitted_field import add_fits, fit_variances
 from .hertz_fit import HertzFit, linearise
-from .local_values import CubeNoise, rotations_about_normal
+from .local_values import CubeNoise, rotations_about_normal, unroll_points
 from .node_fit import NodeFit
 from .pressure_regions import PressureRegions
 from .tracked_region import (
-    MAX_START_SIZE,
-    MAX_STEPS,
+    WORK_MS,
     TrackedRegion,
     Work,
     update_responses,
@@ -47,21 +45,12 @@ when the regions beside it are fitted, too."""
 MAX_REGIONS = 32
 """Largest number of regions of contact on one skin; those with the largest pressure are kept."""
 
-MAX_WORK_PER_SCAN = 40
-"""Computing work in one scan (set of values of all cubes) after which no further step of a fit is
-made; the remaining steps are made in the next scans.
+MAX_WORK_PER_SCAN = 7.2
+"""Computing work in one scan (set of values of all cubes), in ms (`WORK_MS`), up to which further
+steps of fits are made; the remaining steps are made in the next scans. One step is always made."""
 
-The unit is the time that a new fit takes per node (one of the small contacts whose sum is the
-traction of a region), so a new fit with 80 nodes counts 80.
-"""
-
-MAX_NODE_UPDATES = 8
-"""Largest number of fits on nodes that are computed again for the values of one scan. If there are
-more, they take turns, and the others are reported as coarse."""
-
-FIRST_FIT_WORK = 20
-"""Computing work, in the unit of `MAX_WORK_PER_SCAN`, of the first fit of a Hertz contact, which
-takes four to six Gauss-Newton steps."""
+TRACKING_WORK_MS = 0.15
+"""CPU time in ms that it takes to compute a fit for the values of the next scan."""
 
 MATCH_PITCHES = 1.0
 """Largest distance that a contact moves between two scans, divided by the pitch (distance of
@@ -96,9 +85,9 @@ class TrackedContact(NamedTuple):
         moment_uncertainty: Standard deviation of the moment, in N m.
         area_uncertainty: Standard deviation of the area, in m^2.
         refined: Whether force, position and moment come from a fit of the traction in the region of
-            contact to the newest values, and all regions near it are fitted, too. If not, they are
-            less exact: integrals of the linear field (`COARSE_DEVIATION`), results of an earlier
-            fit, scaled with the pressure, or results of a fit near a region that has no fit yet.
+            contact, and all regions near it are fitted, too. If not, they are less exact: integrals
+            of the linear field (`COARSE_DEVIATION`), or results of a fit near a region that has no
+            fit yet.
     """
 
     id: int
@@ -158,9 +147,8 @@ class ContactTracker:
             values: Components (cubes, 15) in Pa and Pa/m, NaN where unknown.
             uncertain: Whether the compensation of each cube is uncertain, so that a new contact
                 needs `UNCERTAIN_PRESSURE`; None: of no cube.
-            max_work: Computing work, in the unit of `MAX_WORK_PER_SCAN`, after which no further
-                step of a fit is made in this scan. 0: no fit is made or improved. Infinite: all
-                fits are improved as far as possible.
+            max_work: Computing work in ms (`MAX_WORK_PER_SCAN`). 0: no fit is made or improved.
+                Infinite: all fits are improved as far as possible.
 
         Returns:
             Contacts, the one with the largest normal force first.
@@ -168,34 +156,27 @@ class ContactTracker:
         inverse = self._inverse
         scaled = inverse.scaled(values)
         self._scaled = scaled
-        field = inverse.field_of_scaled(scaled)
-        self._follow_regions(field.depth_pressure, uncertain)
+        self._follow_regions(inverse.depth_pressure_of_scaled(scaled), uncertain)
         regions = self._regions
         self._noise.update(scaled, self._fitted_cubes)
         for region in regions:
             region.drop_nodes_of_other_values()
-        fitted = self._choose_updates(max_work)
-        self._update_fits(fitted)
+        self._update_fits()
 
-        # Contacts in regions without a fit are integrals of the traction field.
-        coarse = {}
-        unfitted = [region for region in regions if region.fit is None]
-        if unfitted:
-            integrals = self._integrate_field(unfitted, field)
-            coarse = dict(zip(unfitted, integrals, strict=True))
-            for region, contact in coarse.items():
-                region.start = self._start_of_fit(contact)
+        if len(self._fits) < len(regions):
+            self._integrate_field(inverse.field_of_scaled(scaled))
         if max_work > 0:
             self._improve_fits(max_work)
 
         contacts = []
         for region in regions:
-            if region.fit is None:
-                contacts.append(coarse[region])
+            fit = region.fit
+            if fit is None:
+                contacts.append(self._to_parent_frame(region.home, region.integral, False))
                 continue
-            is_refined = region.has_fitted_neighbours and region.is_updated
-            for one in region.estimate_contacts():
-                contacts.append(self._to_parent_frame(one, region.fit, is_refined))
+            for one in fit.estimate_contacts():
+                is_refined = region.has_fitted_neighbours
+                contacts.append(self._to_parent_frame(fit.values.home, one, is_refined))
         pressing = [one for one in contacts if one.normal_force > 0]
         return self._number_contacts(pressing)
 
@@ -276,17 +257,21 @@ class ContactTracker:
         # points that belonged to no region.
         unmatched: list[TrackedRegion | None] = [*self._regions, None]
         regions = []
+        is_changed = len(found) != len(self._regions)
         for points in found:
             n_common = np.bincount(owner[points], minlength=len(unmatched))
             n_common[-1] = 0
             best = int(n_common.argmax())
             old = unmatched[best] if n_common[best] else None
             unmatched[best] = None
-            region = old or TrackedRegion(self._inverse, self._noise)
+            region = old or TrackedRegion(self._inverse, self._noise, self._respond)
             peak = float(pressure[points].max())
+            is_changed |= points is not region.points
             region.begin_scan(points, peak)
             regions.append(region)
         self._regions = regions
+        if not is_changed:
+            return
         distances = self._measure_region_distances(found)
         for number, (region, row) in enumerate(zip(regions, distances, strict=True)):
             is_near = row < NEIGHBOUR_REACH_PITCHES * self._inverse.pitch
@@ -313,42 +298,22 @@ class ContactTracker:
         to_regions = np.minimum.reduceat(to_points, starts, axis=1)
         return np.asarray(to_regions)
 
-    def _choose_updates(self, max_work: float) -> list[TrackedRegion]:
-        """Return the regions whose fits are computed again for the newest values.
-
-        These are all regions with Hertz contacts. Among the other regions, whose traction is fitted
-        on nodes (small contacts on a grid), the `MAX_NODE_UPDATES` are chosen that have waited
-        longest.
-
-        Args:
-            max_work: As `MAX_WORK_PER_SCAN`. Infinite: all fitted regions are chosen.
-        """
-        nodes = [region for region in self._fitted if isinstance(region.fit, NodeFit)]
-        waiting = []
-        if np.isfinite(max_work):
-            nodes.sort(key=lambda region: -region.age)
-            waiting = nodes[MAX_NODE_UPDATES:]
-        return [region for region in self._fitted if region not in waiting]
-
-    def _update_fits(self, chosen: list[TrackedRegion]) -> None:
-        """Compute fits for the newest values.
+    def _update_fits(self) -> None:
+        """Compute all fits for the newest values.
 
         The response of the cubes to the other regions is subtracted from their values before.
-
-        Args:
-            chosen: Regions whose fits are computed.
         """
-        fits = [region.fit for region in chosen]
-        moved = [fit for fit in fits if isinstance(fit, HertzFit) and fit.needs_linearisation]
-        linearise(self._inverse, moved)
         fitted = self._fitted
+        hertz_fits = [fit for fit in self._fits if isinstance(fit, HertzFit)]
+        linearise(self._inverse, [fit for fit in hertz_fits if fit.needs_linearisation])
         if len(fitted) > 1:
             update_responses(self._inverse, fitted, self._fitted_cubes)
         total, deviation = self._sum_responses()
-        for region, fit in zip(chosen, fits, strict=True):
+        for region in fitted:
+            fit = region.fit
             if fit is not None:
                 region.subtract_others(fit.values, total, deviation)
-                region.step(fit, self._scaled)
+                region.step()
                 if region.near:
                     cubes = fit.values.cubes
                     explained = fit.explained
@@ -376,182 +341,107 @@ class ContactTracker:
             update_responses(self._inverse, self._regions, cubes)
         return self._sum_responses()
 
-    def _start_of_fit(self, contact: TrackedContact) -> tuple[int, Discs]:
-        """Return the start of the fit of a contact.
-
-        Returns:
-            Index of the home cube (the cube nearest to the contact, around which the skin is laid
-            flat for the fit), and the Hertz contact from which the fit begins, in its frame.
-        """
-        inverse = self._inverse
-        normals = inverse.poses.rotation[:, :, 2]
-        above = inverse.poses.position + inverse.depth * normals
-        offset = contact.position - above
-        distance = np.linalg.norm(offset, axis=1)
-        home = int(distance.argmin())
-        rotation = inverse.poses.rotation[home]
-        tangential_axes = rotation[:, :2]
-        place = offset[home] @ tangential_axes
-        # The area of the contact is that of its region of pressure at the depth of the cubes, where
-        # the squared radius of a contact is larger by about the squared depth.
-        squared_radius = contact.area / np.pi - inverse.depth**2
-        smallest = inverse.depth / 2
-        largest = MAX_START_SIZE * inverse.depth
-        squared_radius = np.clip(squared_radius, smallest**2, largest**2)
-        force = contact.force @ rotation
-        log_radius = np.log([squared_radius]) / 2
-        return home, Discs(force[None], place[None], log_radius)
-
     def _improve_fits(self, max_work: float) -> None:
         """Make and improve fits of regions, the most urgent first (`Work`), up to a limit of work.
 
         Args:
-            max_work: Work that is left in this scan, in the unit of `MAX_WORK_PER_SCAN`.
+            max_work: As `MAX_WORK_PER_SCAN`.
         """
-        spent = self._begin_hertz_fits(max_work)
         # Among equally urgent regions, the one that has waited longest comes first.
         order = [(region.next_work, -region.waited) for region in self._regions]
+        left = max_work - TRACKING_WORK_MS * len(order)
+        is_first = True
         while order:
             number = min(range(len(order)), key=order.__getitem__)
             region = self._regions[number]
             work, _ = order[number]
-            if work == Work.NONE or spent >= max_work:
+            if work == Work.NONE or (left < WORK_MS[work] and not is_first):
                 break
-            spent += region.improve(work, self._scaled, self._respond)
+            region.improve(work)
+            left -= WORK_MS[work]
+            is_first = False
             order[number] = region.next_work, -region.waited
 
-    def _begin_hertz_fits(self, max_work: float) -> float:
-        """Fit a Hertz contact to each region that has no fit yet, as far as the work allows.
+    def _integrate_field(self, field: TractionField) -> None:
+        """Estimate the contacts of regions without a fit by integrals of the traction field.
 
-        The fits are made together, which takes little longer than one of them.
-
-        Args:
-            max_work: Largest work, in the unit of `MAX_WORK_PER_SCAN`.
-
-        Returns:
-            Work of these fits.
-        """
-        due = [region for region in self._regions if region.needs_hertz_fit]
-        due.sort(key=lambda region: -region.waited)
-        limit = max(max_work // FIRST_FIT_WORK, 1)
-        n_fits = int(min(len(due), limit))
-        due = due[:n_fits]
-        if not due:
-            return 0
-        homes = [region.start[0] for region in due]
-        cubes = np.unique(self._inverse.near[homes])
-        self._noise.update(self._scaled, cubes)
-        total, deviation = self._respond(cubes)
-        trials = [region.begin_hertz_fit(total, deviation) for region in due]
-        moving = list(zip(due, trials, strict=True))
-        for _ in range(MAX_STEPS):
-            linearise(self._inverse, [fit for _, fit in moving])
-            for region, fit in moving:
-                region.step(fit, self._scaled)
-            moving = [(region, fit) for region, fit in moving if fit.needs_linearisation]
-            if not moving:
-                break
-        for region, fit in zip(due, trials, strict=True):
-            region.accept_if_good(fit)
-        return n_fits * FIRST_FIT_WORK
-
-    def _integrate_field(
-        self, unfitted: list[TrackedRegion], field: TractionField
-    ) -> list[TrackedContact]:
-        """Estimate contacts by integrals of the traction field over their regions of contact.
-
-        Args:
-            unfitted: Regions whose contacts are to be estimated.
-            field: Traction on the surface.
-        """
-        inverse, regions = self._inverse, self._regions
-        # The traction field of a narrow contact is blurred beyond its region. So the integral takes
-        # in all points of the surface within a pitch of the region to which no other region is
-        # nearer.
-        region_points = np.concatenate([one.points for one in regions])
-        sizes = [len(one.points) for one in regions]
-        numbers = np.repeat(np.arange(len(regions)), sizes)
-        tree = cKDTree(inverse.points[region_points])
-        distance, nearest = tree.query(inverse.points, distance_upper_bound=inverse.pitch)
-        # Points without a region within this distance have an infinite one.
-        own = np.flatnonzero(np.isfinite(distance))
-        owner = numbers[nearest[own]]
-
-        rotation = inverse.poses.rotation[inverse.cube[own]]
-        force = inverse.area * field.traction[own]
-        pressing = -force[:, 2:]
-        tangential_axes = rotation[:, :, :2]
-        tangential = force[:, :2]
-        shear = np.einsum("nij,nj->ni", tangential_axes, tangential)
-        moments = pressing * inverse.points[own]
-        normals = pressing * rotation[:, :, 2]
-        rows = np.hstack([pressing, shear, moments, normals])
-        order = np.argsort(owner, kind="stable")
-        every_number = np.arange(len(regions))
-        firsts = np.searchsorted(owner[order], every_number)
-        sums = np.add.reduceat(rows[order], firsts)
-        return [
-            self._coarse_contact(sums[number], sizes[number])
-            for number, region in enumerate(regions)
-            if region in unfitted
-        ]
-
-    def _coarse_contact(self, sums: Array, count: int) -> TrackedContact:
-        """Return the contact of a region from integrals of the traction field.
-
-        Args:
-            sums: Sums (10,) over the points around the region: normal force in N, shear force (3,)
-                in N, first moments (3,) of the pressure in N m, normals (3,) times normal forces.
-            count: Number of points of the region. Each one stands for a square of the surface, and
-                the area of the contact is that of these squares.
+        The normal force is the integral of the pressure at the depth of the cubes, which equals
+        that on the surface, but is blurred beyond the region. So the integrals take in all points
+        around a region, and those around several regions are shared among them.
         """
         inverse = self._inverse
-        normal_force = float(sums[0])
-        shear = sums[1:4]
-        divisor = max(normal_force, 1e-12)
-        normal = sums[7:] / divisor
-        normal /= max(float(np.linalg.norm(normal)), 1e-12)
-        area = count * inverse.area
-        deviation = COARSE_DEVIATION * abs(normal_force)
-        return TrackedContact(
-            id=-1,
-            position=sums[4:7] / divisor,
-            normal=normal,
-            force=shear - normal * normal_force,
-            normal_force=normal_force,
-            shear_force=float(np.linalg.norm(shear)),
+        around = [self._pressure_regions.find_around(one.points) for one in self._regions]
+        claims = np.zeros(len(inverse.points))
+        owner = np.full(len(claims), -1)
+        for number, (region, points) in enumerate(zip(self._regions, around, strict=True)):
+            claims[points] += 1
+            owner[region.points] = number
+        claims[owner >= 0] = 1
+        for number, (region, points) in enumerate(zip(self._regions, around, strict=True)):
+            if region.fit is None:
+                is_own = (owner[points] == number) | (owner[points] < 0)
+                own = points[is_own]
+                region.integral = self._integrate(region, own, inverse.area / claims[own], field)
+
+    def _integrate(
+        self,
+        region: TrackedRegion,
+        own: Index,
+        weight: Array,
+        field: TractionField,
+    ) -> ContactEstimate:
+        """Integrate the field around a region over n points, in the frame of its home cube.
+
+        Args:
+            region: The region.
+            own: Indices (n,) of the points.
+            weight: Area (n,) in m^2 that each point represents.
+            field: Traction on the surface.
+        """
+        inverse = self._inverse
+        pressing = weight * field.depth_pressure[own]
+        normal_force = float(pressing.sum())
+        _, angle = inverse.unroll(region.home, inverse.cube[own])
+        from_home = rotations_about_normal(angle)
+        traction = np.einsum("nba,nb->na", from_home, field.traction[own])
+        force = weight @ traction
+        force[2] = -normal_force
+        place = pressing @ unroll_points(inverse, region.home, own)
+        area = len(region.points) * inverse.area
+        variance = (COARSE_DEVIATION * normal_force) ** 2
+        return ContactEstimate(
+            force=force,
+            force_covariance=variance * np.eye(3),
+            place=place / max(normal_force, 1e-12),
+            place_variance=np.full(2, (COARSE_DEVIATION * inverse.pitch) ** 2),
             moment=0.0,
+            moment_variance=variance * area,
             area=area,
-            position_uncertainty=COARSE_DEVIATION * inverse.pitch,
-            force_uncertainty=deviation,
-            shear_uncertainty=deviation,
-            moment_uncertainty=deviation * float(np.sqrt(area)),
-            area_uncertainty=area,
-            refined=False,
+            area_variance=area**2,
+            aspect=1.0,
         )
 
     def _to_parent_frame(
         self,
+        home: int,
         estimate: ContactEstimate,
-        fit: HertzFit | NodeFit,
         is_refined: bool,
     ) -> TrackedContact:
         """Convert an estimate from the flattened skin to the skin's parent frame.
 
         Args:
+            home: Index of the cube around which the skin is laid flat.
             estimate: Force and position of the contact, with variances, on the flattened skin.
-            fit: Fit of the region of the contact.
             is_refined: Whether the estimate counts as refined.
         """
         inverse = self._inverse
-        around = fit.values
-        offset = estimate.place - around.place
+        places, angles = inverse.unroll(home, slice(None))
+        offset = estimate.place - places
         squared_distance = (offset**2).sum(axis=1)
-        nearest = int(squared_distance.argmin())
-        to_cube = rotations_about_normal(around.angle[nearest])
-        cube = around.cubes[nearest]
+        cube = int(squared_distance.argmin())
+        to_cube = rotations_about_normal(angles[cube])
         rotation = inverse.poses.rotation[cube]
-        local = to_cube[:2, :2] @ offset[nearest]
+        local = to_cube[:2, :2] @ offset[cube]
         from_cube = np.array([*local, inverse.depth])
         position = inverse.poses.position[cube] + rotation @ from_cube
 

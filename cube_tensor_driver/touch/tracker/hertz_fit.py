@@ -299,8 +299,7 @@ class HertzFit:
         self._previous = found
         if extrapolates and previous is not None:
             limit = _MAX_STEP * self._depth
-            shift = found.centres - previous.centres
-            shift = np.clip(shift, -limit, limit)
+            shift = (found.centres - previous.centres).clip(-limit, limit)
             centres = found.centres + shift
             forces = 2 * found.forces - previous.forces
             self.found = found._replace(centres=centres, forces=forces)
@@ -484,7 +483,8 @@ def linearise(inverse: SurfaceInverse, fits: Sequence[HertzFit]) -> None:
     """
     by_shape: dict[tuple[int, int], list[HertzFit]] = {}
     for fit in fits:
-        fit.values.refresh()
+        if fit.values.is_stale:
+            fit.values.refresh()
         n_contacts = len(fit.found.forces)
         shape = n_contacts, len(fit.values.cubes)
         by_shape.setdefault(shape, []).append(fit)

@@ -42,7 +42,10 @@ class CubeNoise:
             has variance 1 and no correlation; 0 for unknown values.
         known: Whether each component is known (cubes, C).
         version: Number (cubes,) that increases when the noise of a cube is computed again.
+        scaled: Newest values (cubes, C) in Pa, NaN where unknown.
     """
+
+    scaled: Array
 
     def __init__(self, inverse: SurfaceInverse) -> None:
         self._inverse = inverse
@@ -68,6 +71,7 @@ class CubeNoise:
                 (cubes of the skin, C); NaN where unknown.
             cubes: Indices (n,) of the cubes that are needed.
         """
+        self.scaled = scaled
         inverse = self._inverse
         if self._revision != inverse.revision:
             # The set of pads in use has changed, so all stored variances are invalid (0).
@@ -86,7 +90,7 @@ class CubeNoise:
             outdated = cubes[is_outdated]
             self._replace_pads(outdated, known[is_outdated])
         columns = values[:, :, None]
-        stresses = self._to_pads[cubes] @ columns
+        stresses = self._to_pads.take(cubes, axis=0) @ columns
         stresses = stresses[:, :, 0]
 
         # The predicted stress of a pad is wrong by interpolation errors of the tabulated response
@@ -253,7 +257,7 @@ class LocalValues:
         white = self.whitening @ values[:, :, None]
         return np.asarray(white.ravel())
 
-    def respond(self, centres: Array, size: float) -> tuple[Array, Array]:
+    def respond(self, centres: Array, size: float) -> Array:
         """Compute the response of the cubes to Hertz contacts with a force of 1 N.
 
         Args:
@@ -261,9 +265,8 @@ class LocalValues:
             size: Radius of the contacts in m.
 
         Returns:
-            Response (n, C, 3 K), in Pa/N, of the C components of n cubes, and the whitened response
-            (n C, 3 K), in 1/N. The last axis holds forces along x of all contacts, then along y,
-            then along z.
+            Response (n, C, 3 K), in Pa/N, of the C components of n cubes. The last axis holds
+            forces along x of all contacts, then along y, then along z.
         """
         n = len(self.cubes)
         count = len(centres)
@@ -276,9 +279,7 @@ class LocalValues:
         response = response[:, self._inverse.columns]
         by_contact = response.reshape(n, count, -1, 3)
         by_axis = by_contact.transpose(0, 2, 3, 1)
-        values = by_axis.reshape(*self.known.shape, -1)
-        whitened = self.whitening @ values
-        return values, whitened.reshape(-1, 3 * count)
+        return np.asarray(by_axis.reshape(*self.known.shape, -1))
 
     def sensitivity(self, centres: Array, size: float, forces: Array) -> Array:
         """Compute how errors of the elastomer's properties change the response to Hertz contacts.

@@ -30,12 +30,20 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from ...core.arrays import Array, Index
+from ...core.arrays import Array, Index, Single
 from ...mechanics.traction_prior import SHEAR_RATIO
 from ..inverse import SurfaceInverse
 from ..prior import AMPLITUDE
 from ..surface import make_square_points
-from .contact_estimate import ContactEstimate, ContactSum, Discs, discs_of, estimate_contact
+from .contact_estimate import (
+    N_MOMENTS,
+    ContactEstimate,
+    ContactSum,
+    Discs,
+    discs_of,
+    estimate_contact,
+    moment_polynomials,
+)
 from .local_values import LocalValues, unroll_points
 from .pressure_regions import split_peaks
 
@@ -106,40 +114,62 @@ _RELATIVE_DEVIATIONS = np.array([SHEAR_RATIO, SHEAR_RATIO, 1.0])
 """Prior standard deviations of the traction along x, y and z, divided by that of the pressure."""
 
 
-class Posterior(NamedTuple):
+MIN_SIGNAL_TO_NOISE = 1e-4
+"""Smallest ratio of prior variance to noise of a combination of forces that values still change.
+The others keep their prior mean, 0, and variance, which saves half of the computing time."""
+
+
+class NodePosterior(NamedTuple):
     """Posterior of the forces of q nodes (small contacts whose sum is the traction of a region).
 
+    The k unknowns are the combinations of forces that the values determine, divided by their prior
+    standard deviations. The noise of the N values has variance 1 here; `NodeFit.misfit` multiplies
+    the covariance.
+
     Attributes:
-        forces: Forces (3, q) of the nodes along x, y and z, in N.
-        root: Square root (3, q, n) of their covariance, in N.
-        score: -2 ln of the evidence, up to a constant.
+        response: Whitened response (k, N) to each unknown.
+        shrinkage: Variance (k,) of each unknown after the values are known; 1 before.
+        to_forces: Matrix (3 q, k) from the unknowns to the forces of the nodes in N: along x of all
+            nodes, then along y, then along z.
+        to_errors: Matrix (S - 1, N) from the values to the errors of the properties of the
+            elastomer except the depth, in standard deviations.
+        by_errors: Change (k, S - 1) of `response` times values by these errors.
+        root: Square root (3, q, 3 q + S) of the covariance of the forces, in N.
+        occam_term: Part of -2 ln of the evidence that does not depend on the values.
     """
 
-    forces: Array
+    response: Single
+    shrinkage: Array
+    to_forces: Array
+    to_errors: Array
+    by_errors: Array
     root: Array
-    score: float
+    occam_term: float
 
 
 class NodeFit:
     """Traction in one region on a grid of nodes (small Hertz contacts).
 
+    `solve` and `sharpen` compute the posterior of the forces of the nodes, which takes
+    milliseconds. `step` only multiplies the values of later scans by matrices of this posterior.
+
     Attributes:
         places: Positions (q, 2) of the nodes in m, on the skin laid flat.
         spacing: Distance of neighbouring nodes in m.
         size: Radius of the Hertz contact of a node in m.
-        response: Response (n, C, 3 q), in Pa/N, of the C components of n cubes around the region to
-            the force of each node: along x of all nodes, then along y, then along z.
-        values: Noise and positions of these cubes.
-        posterior: Posterior of the forces for the newest values.
+        values: Noise and positions of n cubes around the region.
+        posterior: Posterior of the forces.
+        forces: Forces (3, q) of the nodes along x, y and z, in N, for the newest values.
         misfit: Chi-squared divided by the number of known values; at least 1. It multiplies the
             covariance of the forces.
+        score: -2 ln of the evidence, up to a constant.
         is_sharp: Whether `sharpen` has found that a narrower prior has no greater evidence.
-        labels: Number (q,) of the contact to which each node belongs.
     """
 
-    posterior: Posterior
+    posterior: NodePosterior
+    forces: Array
     misfit: float
-    labels: Index
+    score: float
 
     def __init__(
         self,
@@ -161,6 +191,7 @@ class NodeFit:
         points_around = unroll_points(inverse, values.home, around)
         self.places, self.spacing = _place_nodes(region_points, points_around, inverse)
         self.size = _NODE_RADIUS * inverse.depth
+        self._peak_width = _PEAK_WIDTH * inverse.depth
 
         # The force of a node is its pressure times the square of the spacing, so covariances of
         # forces contain the fourth power of the spacing.
@@ -171,101 +202,27 @@ class NodeFit:
         pressure_covariance = np.tensordot(_VARIANCE_SHARES, correlations, 1)
         self._covariance = self.spacing**4 * pressure_covariance
 
-        self.response, white = values.respond(self.places, self.size)
-        n_values = len(white)
-        self._white_response = white.reshape(n_values, 3, -1)
-        self._peak_width = _PEAK_WIDTH * inverse.depth
+        # The response (n, C, 3 q) in Pa/N has the forces in the order of `to_forces`.
+        self._response = values.respond(self.places, self.size)
         self.is_sharp = False
-        # `_estimates` are the contacts of the present posterior and labels. They are computed when
-        # they are needed; before that, `_estimates` is None.
-        self._estimates: list[ContactEstimate] | None = None
-        # The sensitivity (n, C, S) holds the changes of the values, in Pa, by one standard
-        # deviation of each of S quantities of the elastomer, the depth first. It is known after the
-        # first step; until then one column of zeros stands for the depth.
-        self._elastomer_errors = np.zeros(0)
-        self._sensitivity = np.zeros((*values.known.shape, 1))
-        self._white_sensitivity = np.zeros((n_values, 1))
-        equal_envelope = np.ones(len(self.places))
-        self._decomposition = self._decompose(equal_envelope)
 
-    def step(self, white: Array) -> None:
-        """Compute `posterior` (forces of the nodes) and `misfit` for new values of the same cubes.
+    def solve(self, white: Array) -> None:
+        """Compute the posterior with the same prior for all nodes.
 
         Args:
             white: Values (n C,), C components of stress and gradient of each of n cubes,
                 transformed by `LocalValues.whiten` so that their noise has variance 1.
         """
-        design, eigenvalues, vectors, basis = self._decomposition
-        # Column 0 holds the values, column 1 their sensitivity to the depth, and the others the
-        # sensitivities to further quantities of the elastomer.
-        columns = np.column_stack([white, self._white_sensitivity])
-        projected = design.T @ columns
-        projected = vectors.T @ projected
-        prior_variances = _SCALES[:, None] ** 2
-
-        # `products` are the products columns' W columns for every scale s, with the matrix
-        # W = (1 + s^2 B K B')^-1. By the Woodbury identity, they are columns' columns minus the
-        # part that the prior of the forces explains.
-        signal_to_noise = prior_variances * eigenvalues
-        weights = prior_variances / (1 + signal_to_noise)
-        explained_by_forces = np.einsum("se,ea,eb->sab", weights, projected, projected)
-        total_products = columns.T @ columns
-        products = total_products - explained_by_forces
-
-        # The errors of all quantities but the depth are estimated together with the forces. The
-        # depth only adds to the covariance.
-        n_errors = columns.shape[1] - 2
-        information = products[:, 2:, 2:] + np.eye(n_errors)
-        gradients = products[:, 2:, :2]
-        errors = np.linalg.solve(information, gradients)
-        by_error = errors[:, :, 0] * gradients[:, :, 0]
-        explained_by_errors = by_error.sum(axis=1)
-        chi_squared = products[:, 0, 0] - explained_by_errors
-        chi_squared = np.maximum(chi_squared, 0)
-        count = self.values.count
-        misfit = np.maximum(chi_squared / count, 1.0)
-
-        scores = np.log1p(signal_to_noise).sum(axis=1)
-        _, log_information = np.linalg.slogdet(information)
-        scores += log_information
-        noise_term = count * np.log(misfit)
-        scores += chi_squared / misfit + noise_term
-        best = int(np.argmin(scores))
-        best_errors = errors[best]
-        self.misfit = float(misfit[best])
-        self._elastomer_errors = best_errors[:, 0]
-
-        precisions = eigenvalues + _SCALES[best] ** -2
-        variances = 1 / precisions
-        amplitudes = variances[:, None] * projected
-        means = basis @ amplitudes
-        by_errors = means[:, 2:]
-        explained_means = by_errors @ best_errors
-        corrected = means[:, :2] - explained_means
-        forces, by_depth = corrected.T
-        # The covariance is the sum of three parts: that for an exactly known elastomer, and those
-        # due to its estimated errors and to the error of the depth. Its square root consists of the
-        # columns of the square roots of these parts.
-        cholesky_factor = np.linalg.cholesky(information[best])
-        errors_root = np.linalg.inv(cholesky_factor).T
-        exact_root = basis * np.sqrt(variances)
-        parts = [exact_root, by_errors @ errors_root, by_depth[:, None]]
-        root = np.sqrt(self.misfit) * np.hstack(parts)
-        n_nodes = len(self.places)
-        self.posterior = Posterior(
-            forces=forces.reshape(3, n_nodes),
-            root=root.reshape(3, n_nodes, -1),
-            score=float(scores[best]),
-        )
-        self._estimates = None
-
-    def update_sensitivity(self) -> None:
-        """Compute how the values change by errors of depth, thickness and Poisson's ratio of the
-        elastomer, under the present forces. The next `step` takes these errors into account."""
-        forces = self.posterior.forces
-        self._sensitivity = self.values.sensitivity(self.places, self.size, forces)
-        white = self.values.whitening @ self._sensitivity
-        self._white_sensitivity = white.reshape(-1, white.shape[2])
+        white_response = self.values.whitening @ self._response
+        self._white_response = white_response.reshape(len(white), 3, -1)
+        no_errors = np.zeros((*self.values.known.shape, 1))
+        self._set_sensitivity(no_errors)
+        equal_envelope = np.ones(len(self.places))
+        self._decomposition = self._decompose(equal_envelope)
+        self._condition(white)
+        self._include_elastomer(white)
+        self.is_sharp = False
+        self._separate_contacts()
 
     def sharpen(self, white: Array) -> None:
         """Fit again with a prior that allows less force where the present fit finds little force.
@@ -274,58 +231,51 @@ class NodeFit:
         the new fit is not clearly higher, the present fit is kept.
 
         Args:
-            white: Values (n C,), divided by their noise: C components of each of n cubes.
+            white: Whitened values (n C,), as for `solve`.
         """
-        self.update_sensitivity()
-        self.step(white)
-        posterior = self.posterior
-        misfit = self.misfit
-        elastomer_errors = self._elastomer_errors
-        decomposition = self._decomposition
-
-        normal_root = posterior.root[2]
-        normal_variance = (normal_root**2).sum(axis=1)
-        mean_square = posterior.forces[2] ** 2 + normal_variance
-        exponents = self._squared_distances / (2 * self.spacing**2)
-        smoothing = np.exp(-exponents)
-        smooth_square = smoothing @ mean_square / smoothing.sum(axis=1)
-        envelope = np.sqrt(smooth_square)
-        relative_envelope = envelope / envelope.max()
-        relative_envelope = np.maximum(relative_envelope, ENVELOPE_FLOOR)
-        self._decomposition = self._decompose(relative_envelope)
-        self.step(white)
-        if self.posterior.score > posterior.score - MIN_SCORE_GAIN:
-            self.posterior = posterior
-            self.misfit = misfit
-            self._elastomer_errors = elastomer_errors
-            self._decomposition = decomposition
+        self._include_elastomer(white)
+        present = self.posterior, self._decomposition
+        score = self.score
+        self._decomposition = self._decompose(self._envelope)
+        self._condition(white)
+        if self.score > score - MIN_SCORE_GAIN:
+            self.posterior, self._decomposition = present
+            self.step(white)
             self.is_sharp = True
-        self.label_peaks()
+        self._separate_contacts()
 
-    def label_peaks(self) -> None:
-        """Set `labels`: assign each node to one of the peaks of the pressure, which are
-        contacts."""
-        forces, force_root, _ = self.posterior
-        exponents = self._squared_distances / (2 * self._peak_width**2)
-        smoothing = np.exp(-exponents)
-        pressure = -smoothing @ forces[2]
-        root = smoothing @ force_root[2]
-        # Diagonal neighbours on the grid are 1.41 spacings apart.
-        reach = 1.5 * self.spacing
-        is_neighbour = self._squared_distances < reach**2
-        self.labels = split_peaks(pressure, root, is_neighbour)
-        self._estimates = None
+    def _include_elastomer(self, white: Array) -> None:
+        """Compute the posterior again, with errors of the elastomer under the present forces."""
+        sensitivity = self.values.sensitivity(self.places, self.size, self.forces)
+        self._set_sensitivity(sensitivity)
+        self._condition(white)
+
+    def step(self, white: Array) -> None:
+        """Compute forces and misfit for new values of the same cubes.
+
+        Args:
+            white: Whitened values (n C,), as for `solve`.
+        """
+        posterior = self.posterior
+        self._errors = posterior.to_errors @ white
+        projected = posterior.response @ white.astype(np.float32)
+        unknowns = posterior.shrinkage * (projected - posterior.by_errors @ self._errors)
+        self.forces = (posterior.to_forces @ unknowns).reshape(3, -1)
+
+        residual = white - unknowns.astype(np.float32) @ posterior.response
+        residual -= self._white_sensitivity[:, 1:] @ self._errors
+        deviations = np.concatenate([residual, unknowns, self._errors])
+        chi_squared = float(deviations @ deviations)
+        count = self.values.count
+        self.misfit = max(chi_squared / count, 1.0)
+        noise_term = count * float(np.log(self.misfit))
+        self.score = chi_squared / self.misfit + noise_term + posterior.occam_term
 
     @property
     def explained(self) -> Array:
-        """Components (n, C), in Pa, that the traction on the nodes causes in the n cubes around the
-        region."""
-        forces = self.posterior.forces.ravel()
-        by_forces = self.response @ forces
-        # The depth is the first quantity; its error only adds to the covariance.
-        sensitivity = self._sensitivity[:, :, 1:]
-        by_errors = sensitivity @ self._elastomer_errors
-        return np.asarray(by_forces + by_errors)
+        """Components (n, C), in Pa, that the forces cause in the cubes around the region."""
+        by_errors = self._sensitivity[:, :, 1:] @ self._errors
+        return np.asarray(self._response @ self.forces.ravel() + by_errors)
 
     @property
     def discs(self) -> Discs:
@@ -334,22 +284,18 @@ class NodeFit:
 
     def estimate_contacts(self) -> list[ContactEstimate]:
         """Return force, centre, moment and area of each contact of the region, by integration."""
-        if self._estimates is not None:
-            return self._estimates
         # For second moments, the force of a node counts as spread over an area as wide as the
         # distance of neighbouring nodes.
         radius = _NODE_RADIUS / NODE_STEP * self.spacing
-        estimates = []
-        n_contacts = self.labels.max() + 1
-        for label in range(n_contacts):
-            own = self.labels == label
-            places = self.places[own]
-            forces = self.posterior.forces[:, own]
-            root = self.posterior.root[:, own]
-            estimate = estimate_contact(places, forces, root, radius)
-            estimates.append(estimate)
-        self._estimates = estimates
-        return estimates
+        return [
+            estimate_contact(
+                centre,
+                self.forces @ polynomials,
+                np.sqrt(self.misfit) * root,
+                radius,
+            )
+            for centre, polynomials, root in self._contacts
+        ]
 
     @property
     def shape_misfit(self) -> float:
@@ -367,22 +313,130 @@ class NodeFit:
         Args:
             step: Not used here; `HertzFit.to_contacts` needs it.
         """
-        forces, root, _ = self.posterior
         sizes = np.full(len(self.places), self.size)
-        return ContactSum(self.places, sizes, forces, root)
+        root = np.sqrt(self.misfit) * self.posterior.root
+        return ContactSum(self.places, sizes, self.forces, root)
 
-    def _decompose(self, envelope: Array) -> tuple[Array, Array, Array, Array]:
+    def _set_sensitivity(self, sensitivity: Array) -> None:
+        """Set how the values change by errors of the elastomer under the present forces.
+
+        Args:
+            sensitivity: Changes (n, C, S) in Pa by one standard deviation of each of S properties
+                of the elastomer, the depth first.
+        """
+        self._sensitivity = sensitivity
+        white = self.values.whitening @ sensitivity
+        self._white_sensitivity = white.reshape(-1, white.shape[2])
+
+    def _condition(self, white: Array) -> None:
+        """Compute `posterior` with the scale of the prior that has the largest evidence.
+
+        Args:
+            white: Whitened values (n C,).
+        """
+        eigenvalues, to_amplitudes, basis = self._decomposition
+        # Column 0 holds the values, column 1 their sensitivity to the depth, and the others the
+        # sensitivities to further properties of the elastomer.
+        columns = np.column_stack([white, self._white_sensitivity])
+        projected = to_amplitudes @ columns
+        prior_variances = _SCALES[:, None] ** 2
+
+        # `products` are the products columns' W columns for every scale s, with the matrix
+        # W = (1 + s^2 B K B')^-1. By the Woodbury identity, they are columns' columns minus the
+        # part that the prior of the forces explains.
+        signal_to_noise = prior_variances * eigenvalues
+        weights = prior_variances / (1 + signal_to_noise)
+        explained_by_forces = (projected.T * weights[:, None]) @ projected
+        products = columns.T @ columns - explained_by_forces
+
+        # The errors of all properties but the depth are estimated together with the forces. The
+        # depth only adds to the covariance.
+        n_errors = columns.shape[1] - 2
+        information = products[:, 2:, 2:] + np.eye(n_errors)
+        gradients = products[:, 2:, :2]
+        errors = np.linalg.solve(information, gradients)
+        by_error = errors[:, :, 0] * gradients[:, :, 0]
+        chi_squared = products[:, 0, 0] - by_error.sum(axis=1)
+        chi_squared = np.maximum(chi_squared, 0)
+        count = self.values.count
+        misfit = np.maximum(chi_squared / count, 1.0)
+
+        _, log_information = np.linalg.slogdet(information)
+        occam_terms = np.log1p(signal_to_noise).sum(axis=1) + log_information
+        scores = chi_squared / misfit + count * np.log(misfit) + occam_terms
+        best = int(np.argmin(scores))
+
+        scale = _SCALES[best]
+        variances = weights[best]
+        by_column = basis @ (variances[:, None] * projected[:, 1:])
+        by_depth = by_column[:, :1] - by_column[:, 1:] @ errors[best][:, 1:]
+        # The covariance is the sum of three parts: that for an exactly known elastomer, and those
+        # due to its estimated errors and to the error of the depth. Its square root consists of the
+        # columns of the square roots of these parts.
+        cholesky_factor = np.linalg.cholesky(information[best])
+        errors_root = np.linalg.inv(cholesky_factor).T
+        exact_root = basis * np.sqrt(variances)
+        root = np.hstack([exact_root, by_column[:, 1:] @ errors_root, by_depth])
+        to_errors = columns[:, 2:].T - (projected[:, 2:].T * variances) @ to_amplitudes
+        is_known = signal_to_noise[best] > MIN_SIGNAL_TO_NOISE
+        self.posterior = NodePosterior(
+            response=(scale * to_amplitudes[is_known]).astype(np.float32),
+            shrinkage=variances[is_known] / scale**2,
+            to_forces=scale * basis[:, is_known],
+            to_errors=np.linalg.solve(information[best], to_errors),
+            by_errors=scale * projected[is_known, 2:],
+            root=root.reshape(3, len(self.places), -1),
+            occam_term=float(occam_terms[best]),
+        )
+        self.step(white)
+
+    @property
+    def _envelope(self) -> Array:
+        """Prior standard deviations (q,) of the nodes for the next `solve`, divided by the largest
+        one: those of the present forces, smoothed over neighbouring nodes."""
+        normal_variance = self.misfit * (self.posterior.root[2] ** 2).sum(axis=1)
+        mean_square = self.forces[2] ** 2 + normal_variance
+        smoothing = np.exp(-self._squared_distances / (2 * self.spacing**2))
+        smooth_square = smoothing @ mean_square / smoothing.sum(axis=1)
+        envelope = np.sqrt(smooth_square / smooth_square.max())
+        return np.asarray(envelope.clip(ENVELOPE_FLOOR))
+
+    def _separate_contacts(self) -> None:
+        """Assign each node to one of the peaks of the pressure, which are contacts."""
+        exponents = self._squared_distances / (2 * self._peak_width**2)
+        smoothing = np.exp(-exponents)
+        root = self.posterior.root
+        normal_root = np.sqrt(self.misfit) * root[2]
+        # Diagonal neighbours on the grid are 1.41 spacings apart.
+        reach = 1.5 * self.spacing
+        is_neighbour = self._squared_distances < reach**2
+        labels = split_peaks(-smoothing @ self.forces[2], smoothing @ normal_root, is_neighbour)
+        # Each contact is described by its centre, the polynomials of its nodes, and a square root
+        # of the covariance of its moments.
+        self._contacts = []
+        for label in range(labels.max() + 1):
+            own = labels == label
+            centre = self.places[own].mean(axis=0)
+            polynomials = np.zeros((len(labels), N_MOMENTS))
+            polynomials[own] = moment_polynomials(self.places[own] - centre)
+            moments_root = polynomials.T @ root
+            columns = moments_root.reshape(3 * N_MOMENTS, -1).T
+            triangle = np.asarray(np.linalg.qr(columns, mode="r"))
+            self._contacts.append((centre, polynomials, triangle.T.reshape(3, N_MOMENTS, -1)))
+
+    def _decompose(self, envelope: Array) -> tuple[Array, Array, Array]:
         """Compute the eigenvalues and eigenvectors from which every posterior follows.
+
+        The unknowns are combinations of the forces with independent priors of variance 1. D is the
+        design matrix (n C, 3 q), the whitened values under each of them.
 
         Args:
             envelope: Prior standard deviation (q,) of the force of each of q nodes, divided by the
                 largest one.
 
         Returns:
-            Design matrix D (n C, 3 q): whitened values (C of each of n cubes) under unknowns with
-            independent priors of variance 1; eigenvalues (3 q,) and eigenvectors (3 q, 3 q) of
-            D' D; and the matrix (3 q, 3 q) from amplitudes of the eigenvectors to the forces of the
-            nodes.
+            Eigenvalues (3 q,) of D' D with the eigenvectors V (3 q, 3 q); the product V' D'; and
+            the matrix (3 q, 3 q) from amplitudes of the eigenvectors to the forces of the nodes.
         """
         covariance = self._covariance * np.outer(envelope, envelope)
         # Rounding errors could give the covariance a negative eigenvalue, and this tiny increase of
@@ -390,21 +444,14 @@ class NodeFit:
         n_nodes = len(covariance)
         covariance[np.diag_indices(n_nodes)] *= 1 + 1e-8
         cholesky_factor = np.linalg.cholesky(covariance)
-        columns = []
-        for axis, deviation in enumerate(_RELATIVE_DEVIATIONS):
-            white_response = self._white_response[:, axis]
-            force_root = cholesky_factor * deviation
-            columns.append(white_response @ force_root)
-        design = np.concatenate(columns, axis=1)
-        gram_matrix = design.T @ design
-        eigenvalues, vectors = np.linalg.eigh(gram_matrix)
+        axis_roots = _RELATIVE_DEVIATIONS[:, None, None] * cholesky_factor
+        by_axis = self._white_response.reshape(-1, 3, n_nodes).swapaxes(0, 1)
+        design = np.concatenate(by_axis @ axis_roots, axis=1)
+        eigenvalues, vectors = np.linalg.eigh(design.T @ design)
         # Rounding errors may make the smallest eigenvalues negative.
         eigenvalues = np.maximum(eigenvalues, 0)
-        vectors_by_axis = vectors.reshape(3, n_nodes, -1)
-        basis = cholesky_factor @ vectors_by_axis
-        basis = basis * _RELATIVE_DEVIATIONS[:, None, None]
-        basis = basis.reshape(3 * n_nodes, -1)
-        return design, eigenvalues, vectors, basis
+        basis = axis_roots @ vectors.reshape(3, n_nodes, -1)
+        return eigenvalues, vectors.T @ design.T, basis.reshape(3 * n_nodes, -1)
 
 
 def _place_nodes(

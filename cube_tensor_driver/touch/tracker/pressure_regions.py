@@ -108,6 +108,11 @@ class PressureRegions:
             key=lambda region: -float(pressure[region].max()),
         )
 
+    def find_around(self, points: Index) -> Index:
+        """Return the indices of all points within `JOIN_PITCHES` of some points, with these."""
+        around = np.unique(self._wide_neighbours[points])
+        return np.asarray(around[around < len(self._inside)])
+
     def _connect_points(self) -> list[Index]:
         """Return the indices of the points of each region, without an order of the regions."""
         inside = np.flatnonzero(self._inside)

@@ -61,10 +61,10 @@ The misfit of the right model is 1 with a standard deviation of 0.12 for 9 cubes
 each, and of 0.2 for planar cubes, whose pads lie in one plane and determine fewer values.
 """
 
-MAX_NEAR_MISFIT = 200.0
+MAX_NEAR_MISFIT = 10.0
 """Misfit (chi-squared per known value) up to which the first Hertz contact of a region is kept
-while other regions are near, whose contacts may cause the misfit. Two balls that are fitted as one
-contact have a larger one."""
+while other regions are near, whose contacts may cause the misfit. Larger ones were misfits of
+fingertips, or of two balls that were fitted as one contact."""
 
 MAX_BAD_SCANS = 5
 """Number of successive scans (sets of values of all cubes) with too large a misfit (chi-squared per
@@ -120,12 +120,6 @@ forces of fourteen contacts were off by 2.2 stated deviations."""
 MAX_STEPS = 10
 """Largest number of Gauss-Newton steps in the first fit of a Hertz contact."""
 
-STEP_WORK = 5
-"""Work (computing time) of one Gauss-Newton step of a Hertz contact, in the unit of
-`MAX_WORK_PER_SCAN`: the step takes as long as a new fit of the traction on this number of nodes
-(small contacts on a grid)."""
-
-
 Respond = Callable[[Index], tuple[Array, Array]]
 """Function that takes the indices of n cubes and returns the response of all cubes of the skin to
 all regions of contact, up to date for these n: changes (cubes, C), in Pa, of their C measured
@@ -135,18 +129,31 @@ components, and the standard deviations of these changes (cubes, C), in Pa."""
 class Work(IntEnum):
     """Next step of the fit of a region of contact. Steps with the smallest number are made first.
 
-    MOVE makes a Gauss-Newton step of Hertz contacts. BEGIN makes the first fit. CHOOSE tries Hertz
-    contacts in place of the traction on nodes (small contacts on a grid). FIT makes a new fit of
-    the traction on nodes. SHARPEN repeats it for the same values with a narrower prior. NONE stands
+    MOVE makes a Gauss-Newton step of Hertz contacts. BEGIN makes the first fit of a Hertz contact.
+    SOLVE makes the fit on nodes (small contacts on a grid) that PREPARE has placed. CHOOSE tries
+    Hertz contacts in its place. SHARPEN repeats the fit on nodes with a narrower prior. NONE stands
     for a fit that needs no step.
     """
 
     MOVE = 0
     BEGIN = 1
-    CHOOSE = 2
-    FIT = 3
-    SHARPEN = 4
-    NONE = 5
+    SOLVE = 2
+    CHOOSE = 3
+    PREPARE = 4
+    SHARPEN = 5
+    NONE = 6
+
+
+WORK_MS = {
+    Work.MOVE: 0.5,
+    Work.BEGIN: 2.0,
+    Work.SOLVE: 4.0,
+    Work.CHOOSE: 2.5,
+    Work.PREPARE: 3.0,
+    Work.SHARPEN: 4.0,
+}
+"""CPU time in ms that the steps of a large region were measured to take. The work in a scan is
+counted with these numbers, not with a clock, so that a recording gives the same contacts again."""
 
 
 class TrackedRegion:
@@ -165,13 +172,13 @@ class TrackedRegion:
         others: Response (n, C), in Pa, of the n cubes of the fit to all other regions.
         gap: Distance from the nearest other region in m.
         response: Response (cubes, C), in Pa, of all cubes of the skin to this region.
-        start: Index of the home cube (around which the skin is laid flat; its frame is that of the
-            fit) and the Hertz contact at which the first fit begins.
+        home: Index of the cube in the middle of the region, around which the skin is laid flat.
+        integral: Contact of the region as an integral of the traction field, in the frame of `home`
+            in the scan in which it was computed.
         waited: Number of scans (sets of values of all cubes) since the fit was last improved.
-        age: Number of scans since the fit was last computed for new values.
     """
 
-    def __init__(self, inverse: SurfaceInverse, noise: CubeNoise) -> None:
+    def __init__(self, inverse: SurfaceInverse, noise: CubeNoise, respond: Respond) -> None:
         self.points: Index = np.zeros(0, np.intp)
         self.cubes: Index = np.zeros(0, np.intp)
         self.peak = 0.0
@@ -182,20 +189,23 @@ class TrackedRegion:
         n_cubes = len(inverse.variant)
         self.response = np.zeros((n_cubes, len(inverse.columns)))
         self._responding = np.zeros(n_cubes, bool)
+        self._is_around = np.zeros(n_cubes, bool)
         self.waited = 0
-        self.age = 0
         self._inverse = inverse
         self._noise = noise
+        self._respond = respond
         self._fitted_points = self.points
         self._fitted_peak = 0.0
         self._fitted_others: Array | float = 0.0
         self._first_misfit = 1.0
-        self._is_hertz_due = inverse.pitch < MAX_DIRECT_PITCH * inverse.depth
+        self._is_direct = inverse.pitch < MAX_DIRECT_PITCH * inverse.depth
+        self._is_hertz_due = self._is_direct
+        self._prepared: NodeFit | None = None
         self._is_tried = False
         self._bad_scans = 0
         self._steps = 0
-        self._updated_peak = 1.0
-        self.start: tuple[int, Discs]
+        self.home = -1
+        self.integral: ContactEstimate
         self._responded = (
             -1,
             Discs(
@@ -218,9 +228,14 @@ class TrackedRegion:
         if points is not self.points:
             self.points = points
             self.cubes = np.unique(self._inverse.cube[points])
+            positions = self._inverse.points[points]
+            from_middle = positions - positions.mean(axis=0)
+            middle = (from_middle**2).sum(axis=1).argmin()
+            self.home = int(self._inverse.cube[points[middle]])
+            self._is_around[:] = False
+            self._is_around[self._inverse.near[self.cubes, : NEAREST_CUBES[-1]]] = True
         self.peak = peak
         self.waited += 1
-        self.age += 1
         self._is_tried = False
         self._steps = 0
         fit = self.fit
@@ -263,19 +278,14 @@ class TrackedRegion:
         values = fit.values
         found = fit.found
         below = values.nearest_cubes(found.centres)
-        around = inverse.near[self.cubes, : NEAREST_CUBES[-1]]
-        is_around = around[:, :, None] == below
-        is_in_region = is_around.any(axis=(0, 1))
-        presses = found.forces[:, 2] < 0
-        if not (is_in_region & presses).all():
+        if not (self._is_around[below] & (found.forces[:, 2] < 0)).all():
             self.fit = None
             return
         # The home cube is the origin of the frame of the contacts.
-        mean_centre = found.centres.mean(axis=0)
+        mean_centre = found.centres.sum(axis=0) / len(below)
         from_home = np.hypot(*mean_centre)
         if from_home > HOME_PITCHES * inverse.pitch:
-            (nearest,) = values.nearest_cubes(mean_centre[None])
-            home = int(nearest)
+            home = int(values.nearest_cubes(mean_centre[None])[0])
             if home != values.home:
                 centre_cubes = np.append(below, home)
                 cubes = np.unique(inverse.near[centre_cubes])
@@ -295,6 +305,14 @@ class TrackedRegion:
         facing = cubes[cosines > MIN_FACING]
         return LocalValues(self._inverse, self._noise, home, facing)
 
+    def _collect_newest(self, home: int, cubes: Index) -> LocalValues:
+        """Return what `_collect` returns for the newest values, and set `others` for it."""
+        self._noise.update(self._noise.scaled, cubes)
+        values = self._collect(home, cubes)
+        self.subtract_others(values, *self._respond(cubes))
+        values.refresh()
+        return values
+
     @property
     def has_fitted_neighbours(self) -> bool:
         """Whether all regions in `near` have a fit, so that the response to them is well known."""
@@ -312,7 +330,18 @@ class TrackedRegion:
         frame that act on distant cubes like the traction of this region."""
         if self.fit is not None:
             return self.fit.values.home, self.fit.discs
-        return self.start
+        return self.home, self._start
+
+    @property
+    def _start(self) -> Discs:
+        """Hertz contact at which the first fit begins."""
+        # The area of the integral is that of the pressure at the depth of the cubes, where a
+        # squared radius is larger by about the squared depth.
+        depth = self._inverse.depth
+        squared_radius = self.integral.area / np.pi - depth**2
+        largest = MAX_START_SIZE * depth
+        squared_radius = np.clip(squared_radius, (depth / 2) ** 2, largest**2)
+        return discs_of([self.integral._replace(area=np.pi * squared_radius)])
 
     def stale_cubes(self, cubes: Index) -> Index:
         """Return those of some cubes for which the stored response to this region is out of date.
@@ -363,147 +392,88 @@ class TrackedRegion:
     def next_work(self) -> Work:
         """Next step of the fit of this region."""
         fit = self.fit
-        if fit is None:
-            return Work.NONE if self._is_tried or self._is_hertz_due else Work.BEGIN
+        if fit is None and self._is_hertz_due:
+            return Work.BEGIN
+        if self._prepared is not None:
+            return Work.SOLVE
         is_worse = self._is_misfit_larger
+        may_prepare = not self._is_tried
         if isinstance(fit, HertzFit):
             is_moving = fit.is_unsettled or (is_worse and fit.needs_linearisation)
             if is_moving and self._steps < MAX_STEPS:
                 return Work.MOVE
-            if self._is_tried:
-                return Work.NONE
             is_lastingly_worse = is_worse and self._bad_scans >= MAX_BAD_SCANS
-            is_given_up = is_lastingly_worse and self.has_fitted_neighbours
-            return Work.FIT if is_given_up else Work.NONE
-        if self._is_hertz_due:
-            return Work.CHOOSE
-        peak_change = abs(self.peak / self._fitted_peak - 1)
-        is_changed = max(peak_change, self._moved_share) > MAX_CHANGE
-        is_outdated = is_changed or is_worse or self._have_others_changed(fit)
-        if is_outdated and not self._is_tried:
-            return Work.FIT
-        return Work.NONE if fit.is_sharp else Work.SHARPEN
+            may_prepare &= is_lastingly_worse and self.has_fitted_neighbours
+        elif fit is not None:
+            if self._is_hertz_due:
+                return Work.CHOOSE
+            if may_prepare and self._moved_share <= MAX_CHANGE:
+                peak_change = abs(self.peak / self._fitted_peak - 1)
+                if peak_change > MAX_CHANGE or is_worse or self._have_others_changed(fit):
+                    return Work.SOLVE
+                may_prepare = False
+            if not may_prepare:
+                return Work.NONE if fit.is_sharp else Work.SHARPEN
+        return Work.PREPARE if may_prepare else Work.NONE
 
-    def improve(self, work: Work, scaled: Array, respond: Respond) -> int:
-        """Make the next step of the fit.
+    def improve(self, work: Work) -> None:
+        """Make the next step of the fit, for the newest values.
 
         Args:
             work: Kind of the step (`next_work`).
-            scaled: The C measured components of stress and gradient (times d0, half the side of a
-                cube) of all cubes (cubes, C), in Pa.
-            respond: Function that returns the response of cubes to all regions.
-
-        Returns:
-            Work of this step, in the unit of `MAX_WORK_PER_SCAN`.
         """
         self.waited = 0
         fit = self.fit
-        if isinstance(fit, HertzFit) and work == Work.MOVE:
+        if work == Work.BEGIN:
+            self._begin_hertz()
+        elif work == Work.PREPARE:
+            self._prepare_nodes()
+        elif work == Work.SOLVE:
+            self._solve_nodes()
+        elif isinstance(fit, HertzFit):
             self._steps += 1
-            return self._iterate(fit, scaled, 1)
-        if isinstance(fit, NodeFit) and work == Work.CHOOSE:
-            return self._replace_by_hertz(fit, scaled)
-        if isinstance(fit, NodeFit) and work == Work.SHARPEN:
-            white = fit.values.whiten(scaled, self.others)
-            fit.sharpen(white)
+            self._iterate(fit, 1)
+        elif isinstance(fit, NodeFit) and work == Work.CHOOSE:
+            self._replace_by_hertz(fit)
+        elif isinstance(fit, NodeFit):
+            fit.sharpen(self._whiten(fit.values))
             self._is_hertz_due = fit.is_sharp
-            self._first_misfit = fit.shape_misfit
-            return len(fit.places) // 2
-        return self._fit_nodes(scaled, respond)
+            self._first_misfit = fit.misfit
 
-    def step(self, fit: HertzFit | NodeFit, scaled: Array) -> None:
-        """Compute a fit of this region for the newest values.
+    def step(self) -> None:
+        """Compute the fit of this region for the newest values. A `HertzFit` makes a Gauss-Newton
+        step."""
+        if self.fit is not None:
+            self.fit.step(self._whiten(self.fit.values))
 
-        Args:
-            fit: The fit; a `HertzFit` makes a Gauss-Newton step.
-            scaled: Values (cubes, C), in Pa, of all cubes.
-        """
-        self.age = 0
-        self._updated_peak = self.peak
-        fit.step(fit.values.whiten(scaled, self.others))
+    def _whiten(self, values: LocalValues) -> Array:
+        """Return the newest values of cubes minus the response to other regions, whitened."""
+        return values.whiten(self._noise.scaled, self.others)
 
-    @property
-    def is_updated(self) -> bool:
-        """Whether the fit was computed for the newest values."""
-        return self.age == 0
-
-    def estimate_contacts(self) -> list[ContactEstimate]:
-        """Return the contacts of the fit.
-
-        If the fit was computed for older values, forces and moments are scaled with the change of
-        the largest pressure since, and the stated deviation of a force includes its whole change.
-        """
-        if self.fit is None:
-            return []
-        estimates = self.fit.estimate_contacts()
-        if self.is_updated:
-            return estimates
-        growth = self.peak / self._updated_peak - 1
-        scaled = []
-        for one in estimates:
-            change = growth * one.force
-            covariance = one.force_covariance + np.outer(change, change)
-            moment = (1 + growth) * one.moment
-            scaled.append(
-                one._replace(
-                    force=one.force + change,
-                    force_covariance=covariance,
-                    moment=moment,
-                )
-            )
-        return scaled
-
-    def _iterate(self, fit: HertzFit, scaled: Array, steps: int) -> int:
-        """Make Gauss-Newton steps until the fit has converged.
-
-        Args:
-            fit: Fit that is improved.
-            scaled: Values (cubes, C), in Pa, of all cubes.
-            steps: Largest number of steps.
-
-        Returns:
-            Work (computing time) of the steps, in the unit of `MAX_WORK_PER_SCAN`.
-        """
-        white = fit.values.whiten(scaled, self.others)
-        work = 0
+    def _iterate(self, fit: HertzFit, steps: int) -> None:
+        """Make Gauss-Newton steps, at most a number of them, until the fit has converged."""
+        white = self._whiten(fit.values)
         for _ in range(steps):
             linearise(self._inverse, [fit])
             fit.step(white)
-            work += STEP_WORK * len(fit.found.forces)
             if not fit.needs_linearisation:
                 break
-        return work
 
-    @property
-    def needs_hertz_fit(self) -> bool:
-        """Whether this region has no fit yet, and a Hertz contact is to be fitted first."""
-        return self.fit is None and self._is_hertz_due
+    def _begin_hertz(self) -> None:
+        """Fit one Hertz contact, from the contact that the linear inverse problem found.
 
-    def begin_hertz_fit(self, total: Array, deviation: Array) -> HertzFit:
-        """Return a fit of one Hertz contact, at the contact `start` that the linear inverse problem
-        found.
-
-        Args:
-            total: Response (cubes, C), in Pa, of all cubes to all regions.
-            deviation: Standard deviation (cubes, C) of this response, in Pa.
+        The fit is kept if its steps have converged and its misfit is small. If other regions are
+        near, their contacts may cause the misfit, which then falls when these regions are fitted,
+        too. So the fit is then kept up to a misfit of `MAX_NEAR_MISFIT`, even if its steps have not
+        converged.
         """
-        home, discs = self.start
         self._is_hertz_due = False
-        self.waited = 0
-        values = self._collect(home, self._inverse.near[home])
-        self.subtract_others(values, total, deviation)
-        return HertzFit(self._inverse, values, discs)
-
-    def accept_if_good(self, fit: HertzFit) -> None:
-        """Keep a first fit if its steps have converged and its misfit is small.
-
-        If other regions are near, their contacts may cause the misfit, which then falls when these
-        regions are fitted, too. So the fit is then kept up to a misfit of `MAX_NEAR_MISFIT`, even
-        if its steps have not converged.
-        """
+        values = self._collect_newest(self.home, self._inverse.near[self.home])
+        fit = HertzFit(self._inverse, values, self._start)
+        self._iterate(fit, MAX_STEPS)
         limit = MAX_NEAR_MISFIT if self.near else MAX_HERTZ_MISFIT
         is_settled = not fit.is_unsettled or self.near
-        if fit.values.count and is_settled and fit.shape_misfit < limit:
+        if values.count and is_settled and fit.shape_misfit < limit:
             self._accept(fit)
             self._first_misfit = MAX_HERTZ_MISFIT / MAX_MISFIT_GROWTH
 
@@ -528,68 +498,56 @@ class TrackedRegion:
         self.others = total[cubes] - own
         values.disturbance = deviation[cubes] - self.relative_error * np.abs(own)
 
-    def _fit_nodes(self, scaled: Array, respond: Respond) -> int:
-        """Fit the traction on nodes (small contacts on a grid) in place of the present fit.
+    def _prepare_nodes(self) -> None:
+        """Prepare a fit of the traction on nodes (small contacts on a grid).
 
-        If there are too many cubes or no known values, the present fit stays.
-
-        Returns:
-            Work of the fit, in the unit of `MAX_WORK_PER_SCAN`.
+        If there are too many cubes or no known values, nothing is prepared.
         """
         self._is_tried = True
         inverse = self._inverse
-        points = inverse.points[self.points]
-        below = inverse.cube[self.points]
-        from_centre = points - points.mean(axis=0)
-        distance = np.linalg.norm(from_centre, axis=1)
-        central_point = distance.argmin()
-        home = int(below[central_point])
         for count in NEAREST_CUBES:
             cubes = np.unique(inverse.near[self.cubes, :count])
             if len(cubes) <= MAX_CUBES:
-                break
-        else:
-            return 0
-        self._noise.update(scaled, cubes)
-        values = self._collect(home, cubes)
-        if not values.count:
-            return 0
-        self.subtract_others(values, *respond(cubes))
+                values = self._collect_newest(self.home, cubes)
+                if values.count:
+                    self._prepared = NodeFit(inverse, self.points, values)
+                return
+
+    def _solve_nodes(self) -> None:
+        """Fit the traction on the nodes that have been prepared, or again on those of the present
+        fit."""
+        self._is_tried = True
+        fit = self._prepared or self.fit
+        self._prepared = None
+        if not isinstance(fit, NodeFit) or not fit.values.has_same_values:
+            return
+        values = fit.values
+        self._noise.update(self._noise.scaled, values.cubes)
+        self.subtract_others(values, *self._respond(values.cubes))
         values.refresh()
-        fit = NodeFit(inverse, self.points, values)
-        white = values.whiten(scaled, self.others)
-        fit.step(white)
-        fit.update_sensitivity()
-        fit.step(white)
-        fit.label_peaks()
-        self._is_hertz_due = True
+        fit.solve(self._whiten(values))
+        self._is_hertz_due = not self._is_direct
         self._accept(fit)
-        return len(fit.places)
 
-    def _replace_by_hertz(self, nodes: NodeFit, scaled: Array) -> int:
+    def _replace_by_hertz(self, nodes: NodeFit) -> None:
         """Replace the fit on nodes by one Hertz contact for each of its contacts, if that increases
-        the evidence (probability of the values).
-
-        Returns:
-            Work of the fit of Hertz contacts, in the unit of `MAX_WORK_PER_SCAN`.
-        """
+        the evidence (probability of the values)."""
         self._is_hertz_due = False
         starts = nodes.estimate_contacts()
         largest_aspect = max(one.aspect for one in starts)
         if largest_aspect > MAX_HERTZ_ASPECT:
-            return 1
+            return
         discs = discs_of(starts)
         largest_size = MAX_START_SIZE * self._inverse.depth
         log_sizes = np.minimum(discs.log_sizes, np.log(largest_size))
         discs = discs._replace(log_sizes=log_sizes)
         fit = HertzFit(self._inverse, nodes.values, discs)
-        work = self._iterate(fit, scaled, MAX_STEPS)
+        self._iterate(fit, MAX_STEPS)
         # The evidence of all cubes can hide a misfit of the nearest cubes, so it is tested apart.
         # If there are other regions, their contacts may cause this misfit, and it is ignored.
         is_round = fit.shape_misfit < MAX_HERTZ_MISFIT or np.isfinite(self.gap)
-        if is_round and not fit.is_unsettled and fit.score < nodes.posterior.score:
+        if is_round and not fit.is_unsettled and fit.score < nodes.score:
             self._accept(fit)
-        return work
 
     def _accept(self, fit: HertzFit | NodeFit) -> None:
         """Make `fit` the fit of this region, and store the state of the region at this fit.
@@ -598,8 +556,6 @@ class TrackedRegion:
         regions and the misfit. If later scans differ from it too much, the region is fitted again.
         """
         self.fit = fit
-        self.age = 0
-        self._updated_peak = self.peak
         self._fitted_points = self.points
         self._fitted_peak = self.peak
         self._fitted_others = self.others
