@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING
 from .parser import Parser, positive, uid
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from ..calibrate.fit import Fit
     from ..calibrate.load_table import Loads
     from ..core.arrays import Array
@@ -111,29 +109,16 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def publish(
-    options: argparse.Namespace,
-    calibration: Calibration,
-    picture: Figure,
-    words: str,
-    suffix: str = "",
-) -> None:
-    """Write the picture and the calibration file of a fit, and print the path of the file.
+def write_result(path: Path, calibration: Calibration, words: str) -> None:
+    """Write a calibration file and print its path.
 
     Args:
-        options: The options of the command, with the paths of both files.
-        calibration: The result of the fit.
-        picture: The picture.
+        path: The file.
+        calibration: The result of a fit.
         words: The words behind ./cube fit, which the header of the file states.
-        suffix: Text that is added to the names of both files.
     """
     from ..config.calibration import write_calibration
-    from ..views.figures.style import save
 
-    path, figure = (
-        one.with_stem(f"{one.stem}{suffix}") for one in (options.output, options.figure)
-    )
-    save(picture, figure)
     write_calibration(path, calibration, f"./cube fit {words}")
     print(f"wrote {path}: calibration {calibration.id}")
 
@@ -151,6 +136,7 @@ def run_table(options: argparse.Namespace) -> None:
     from ..core.errors import ConfigError
     from ..core.symmetry import find_structure
     from ..views.figures.calibration import draw_fit
+    from ..views.figures.style import save
 
     if options.loads is None or options.layout is None:
         raise ConfigError(
@@ -185,13 +171,15 @@ def run_table(options: argparse.Namespace) -> None:
     table = options.loads.name
     calibration = result.calibration(base, created, f"fit of {table}, {len(measured)} loads")
     words = f"{table} --layout {options.layout} --symmetry {options.symmetry}"
-    publish(options, calibration, draw_fit(result, measured), words)
+    save(draw_fit(result, measured), options.figure)
+    write_result(options.output, calibration, words)
 
 
 def run_rest(options: argparse.Namespace) -> None:
     """Fit the effect of temperature to bags, print and draw it, and write the calibrations."""
     from ..calibrate.thermal import fit_thermal, read_warming
     from ..views.figures.calibration import draw_thermal_fit
+    from ..views.figures.style import save
     from ..views.terminal.output import print_table
 
     warming = read_warming(options.rest, options.cube)
@@ -207,20 +195,18 @@ def run_rest(options: argparse.Namespace) -> None:
     for name, result in fits.items():
         base, _ = warming[name]
         calibration = result.calibration(base, f"{base.source}; temperature fitted to {bags}")
-        suffix = f"_{name}" if len(fits) > 1 else ""
-        publish(
-            options,
-            calibration,
-            draw_thermal_fit(result),
-            f"--rest {bags}",
-            suffix,
-        )
+        path, picture = options.output, options.figure
+        if len(fits) > 1:
+            path, picture = (one.with_stem(f"{one.stem}_{name}") for one in (path, picture))
+        save(draw_thermal_fit(result), picture)
+        write_result(path, calibration, f"--rest {bags}")
 
 
 def run_weight(options: argparse.Namespace) -> None:
     """Fit the response to weight and inertia to a bag, print it and write the calibration."""
     from ..calibrate.weight import fit_weight
     from ..views.figures.calibration import draw_correction
+    from ..views.figures.style import save
     from ..views.terminal.output import print_table
 
     calibration, *shown = fit_weight(options.weight, options.cube)
@@ -234,14 +220,15 @@ def run_weight(options: argparse.Namespace) -> None:
         rows = [(pad, *values) for pad, values in zip(pads, cells, strict=True)]
         print_table(("pad",), [f"{axis}, Pa per m/s²" for axis in "xyz"], rows)
     title = f"stress of the {len(calibration.gain)} pads under weight alone"
-    picture = draw_correction(title, *shown)
-    publish(options, calibration, picture, f"--weight {options.weight.name}")
+    save(draw_correction(title, *shown), options.figure)
+    write_result(options.output, calibration, f"--weight {options.weight.name}")
 
 
 def run_creep(options: argparse.Namespace) -> None:
     """Fit the creep of the foam to a bag with one press, print it and write the calibration."""
     from ..calibrate.creep import compute_step_reading, fit_recorded_creep
     from ..views.figures.calibration import draw_correction
+    from ..views.figures.style import save
     from ..views.terminal.output import print_table, say
 
     result, calibration = fit_recorded_creep(options.creep, options.cube)
@@ -264,7 +251,8 @@ def run_creep(options: argparse.Namespace) -> None:
         result.before,
         result.after,
     )
-    publish(options, calibration, picture, f"--creep {options.creep.name}")
+    save(picture, options.figure)
+    write_result(options.output, calibration, f"--creep {options.creep.name}")
 
 
 def read_inputs(

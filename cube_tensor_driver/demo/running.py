@@ -19,7 +19,6 @@ from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from ..config.output_files import to_json, write_json
 from ..core.errors import CubeError
 from ..processes.children import Children
 from ..ros.session import STEP_S, node_session, spin_until
@@ -154,15 +153,3 @@ def end_simulator(children: Children, log: Path) -> SampleLog:
     if not log.exists():
         raise CubeError(f"the simulator did not end as asked:\n{children.end_of_log('simulator')}")
     return SampleLog.read(log)
-
-
-def report(result: dict[str, object], json_path: Path | None) -> None:
-    """Print results as JSON, and write them to a file as well if there is a path.
-
-    Args:
-        result: Names and values of the results.
-        json_path: Path of the file; None: no file is written.
-    """
-    print(to_json(result, indent=2))
-    if json_path is not None:
-        write_json(json_path, result)

@@ -16,7 +16,7 @@ BYTES_PER_MB = 2**20
 
 
 class Usage:
-    """Processor time, memory and threads of child processes.
+    """Processor time and memory of child processes.
 
     The processor time is counted from the moment at which the object is made.
     """
@@ -48,10 +48,6 @@ class Usage:
             name: process.memory_info().rss / BYTES_PER_MB
             for name, process in self._processes.items()
         }
-
-    def threads(self) -> dict[str, int]:
-        """Return the number of threads of each process."""
-        return {name: process.num_threads() for name, process in self._processes.items()}
 
     def _sum_cpu_seconds(self) -> dict[str, float]:
         seconds = {}

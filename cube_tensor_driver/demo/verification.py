@@ -17,7 +17,6 @@ from ..config.skin import Skin
 from ..core.arrays import Array, Index
 from ..core.matching import NO_MATCH, SampleKeys
 from ..core.rows import FrequencyRows, StressRows
-from ..simulation.cubes import make_hub_cubes
 from ..simulation.sample_log import SampleTable
 
 NS_TO_MS = 1e-6
@@ -28,32 +27,14 @@ class Arrivals:
     """Stores which rows (one cube at one sampling time) have arrived, and when.
 
     Attributes:
-        row_count: (cubes,) number of rows that each stored row of a cube stands for: 1, or, if only
-            rows of the first cube of each hub are stored, the number of cubes of this hub. It is 0
-            for cubes whose rows are not stored.
+        row_count: (cubes,) number of rows that each stored row of a cube stands for: 1, unless a
+            subclass stores the rows of some cubes only. It is 0 for cubes whose rows are not
+            stored.
         rows: Number of rows that have arrived, stored or not.
     """
 
-    def __init__(
-        self,
-        skin: Skin,
-        *,
-        one_per_hub: bool = False,
-    ) -> None:
-        """Start without rows.
-
-        Args:
-            skin: The skin whose rows arrive.
-            one_per_hub: Whether to store only rows of the first cube of each hub. This saves memory
-                and time, and gives the same counts if the rows of a hub's cubes at one sampling
-                time either all arrive or are all lost.
-        """
+    def __init__(self, skin: Skin) -> None:
         self.row_count = np.ones(len(skin.cubes), np.int64)
-        if one_per_hub:
-            self.row_count[:] = 0
-            for hub in make_hub_cubes(skin):
-                members = hub.skin_cubes
-                self.row_count[members[0]] = len(members)
         self.rows = 0
         no_rows = np.empty((4, 0), np.int64)
         self._parts: list[Index] = [no_rows]

@@ -22,6 +22,7 @@ from cube_tensor_driver.simulation.sample_log import (
     SampleLog,
     SampleRun,
 )
+from workshop.bench.hub_arrivals import HubArrivals
 
 START_NS = 10**18
 PERIOD_US = 2000
@@ -97,9 +98,9 @@ def test_when_a_sample_was_taken_and_how_many_in_a_span():
     assert LOG.table.rows_taken(START_NS, END_NS) == 2 * 30 + 2 * 10
 
 
-@pytest.mark.parametrize("one_per_hub", [False, True])
-def test_rows_that_came_twice_or_were_never_taken_do_not_make_up_for_lost_ones(skin, one_per_hub):
-    arrivals = Arrivals(skin, one_per_hub=one_per_hub)
+@pytest.mark.parametrize("kind", [Arrivals, HubArrivals])
+def test_rows_that_came_twice_or_were_never_taken_do_not_make_up_for_lost_ones(skin, kind):
+    arrivals = kind(skin)
     samples = list(everything())
     for number, rows in enumerate(samples):
         if number not in (4, 17):

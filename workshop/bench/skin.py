@@ -28,7 +28,7 @@ from cube_tensor_driver.core.arrays import Array, Index
 from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.demo.running import observing
 from cube_tensor_driver.demo.usage import Usage
-from cube_tensor_driver.demo.verification import Arrivals, compare, percentile
+from cube_tensor_driver.demo.verification import compare, percentile
 from cube_tensor_driver.messages.codec import stress_codec
 from cube_tensor_driver.msg import SkinStress, SkinTouch
 from cube_tensor_driver.processes.children import Children
@@ -39,6 +39,7 @@ from cube_tensor_driver.simulation.sample_log import SampleTable
 from cube_tensor_driver.views.figures.style import save
 
 from ..torture.memory import median_slope
+from .hub_arrivals import HubArrivals
 from .hubs_in_c import HubLoad, read_samples
 from .scale import draw_scale
 
@@ -203,7 +204,7 @@ def _measure_skin(
         load = HubLoad.of(cubes, bench.pads)
         path = load.write_skin(folder, bench.rate)
         processes = _make_processes(path, log, load, bench)
-        arrivals = Arrivals(read_skin(path), one_per_hub=True)
+        arrivals = HubArrivals(read_skin(path))
         touches: list[tuple[int, int]] = []
 
         def receive(data: bytes) -> None:

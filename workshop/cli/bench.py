@@ -148,7 +148,7 @@ def _add_chain(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run a benchmark and report its figures; the modules of other benchmarks are not imported."""
-    from cube_tensor_driver.demo.running import report
+    from ..report import report
 
     report(_measure(options), options.json)
     return 0

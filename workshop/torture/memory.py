@@ -7,6 +7,7 @@ from __future__ import annotations
 import time
 
 import numpy as np
+import psutil
 
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.demo.usage import Usage
@@ -48,7 +49,8 @@ class MemoryMonitor:
 
     def count_threads(self) -> dict[str, int]:
         """Return the number of threads of each process."""
-        return Usage(self._children, self._names).threads()
+        ids = {name: self._children.pid(name) for name in self._names}
+        return {name: psutil.Process(pid).num_threads() for name, pid in ids.items()}
 
     def growth_mb_per_min(self) -> float | None:
         """Return the growth of the process that grows fastest, None if no process ran long enough.

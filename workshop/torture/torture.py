@@ -16,12 +16,13 @@ from pathlib import Path
 from typing import Any
 
 from cube_tensor_driver.core.errors import ConfigError
-from cube_tensor_driver.demo.running import Interrupted, report
+from cube_tensor_driver.demo.running import Interrupted
 from cube_tensor_driver.processes.domain import own_domain
 from cube_tensor_driver.processes.stop_signals import stop_event
 from cube_tensor_driver.views.terminal.output import progress_bar
 
 from ..checks.all_checks import check_all
+from ..report import report
 from .mutations import MUTATIONS, NEEDS_RESTART
 from .play import play
 
