@@ -171,8 +171,14 @@ class Gate:
         writer: asyncio.StreamWriter,
     ) -> None:
         """Answer one connection of a browser."""
-        failures = (OSError, EOFError, asyncio.LimitOverrunError, asyncio.TimeoutError)
-        with suppress(*failures):
+        # `close` cancels connections; asyncio of Python 3.11 would print that as an error.
+        with suppress(
+            OSError,
+            EOFError,
+            asyncio.LimitOverrunError,
+            asyncio.TimeoutError,
+            asyncio.CancelledError,
+        ):
             head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), MAX_HEAD_S)
             problem, cookie = self._check(head)
             if problem:

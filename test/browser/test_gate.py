@@ -8,6 +8,7 @@ import csv
 import http.client
 import io
 import socket
+import time
 from collections.abc import Iterator
 from types import SimpleNamespace
 
@@ -126,13 +127,16 @@ def test_an_address_that_cannot_be_had_is_refused(host: str) -> None:
         Gate(host, 0, "", (HERE, 1))
 
 
-def test_the_next_port_is_taken_and_a_silent_browser_does_not_hinder_the_end() -> None:
+def test_the_next_port_is_taken_and_a_silent_browser_does_not_hinder_the_end(caplog) -> None:
     first = Gate(HERE, 0, "", (HERE, 1))
     second = Gate(HERE, first.port, "", (HERE, 1))
     assert second.port > first.port
-    with socket.create_connection((HERE, second.port)):
+    with socket.create_connection((HERE, second.port)) as silent:
+        silent.sendall(b"GET")
+        time.sleep(0.1)
         second.close()
     first.close()
+    assert not caplog.records
 
 
 def test_viser_itself_listens_at_no_address_that_a_page_could_guess() -> None:
