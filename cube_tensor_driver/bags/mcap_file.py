@@ -112,8 +112,7 @@ class McapReader:
 
         Raises:
             OSError: The file cannot be read.
-            McapError, ConfigError: Its summary is damaged, or it has none because the recording was
-                cut off.
+            McapError: Its summary is damaged, or it has none because the recording was cut off.
         """
         self._stream = path.open("rb")
         # The checksum is checked first, because it covers every offset and length used below.

@@ -140,19 +140,22 @@ def quality(
 def parse_profiles(text: str, topic: str) -> Sequence[QosProfile]:
     """Return the quality of service profiles that a storage file states for a topic.
 
-    The result is cached, because bags of one robot have the same text for the same topic.
+    The result is cached, because bags of one robot have the same text for the same topic. A damaged
+    text counts as none, because messages can be read without it.
 
     Args:
         text: List of profiles as YAML; "" if the file states none.
-        topic: Name of the topic, for error messages.
-
-    Raises:
-        ConfigError: The text is not a list of mappings in YAML.
+        topic: Name of the topic, for warnings.
     """
-    profiles: object = parse_yaml(text or "[]", topic)
-    if not isinstance(profiles, list) or not all(isinstance(one, dict) for one in profiles):
-        raise ConfigError(f"{topic}: its quality of service profiles are no list of mappings")
-    return profiles
+    reason = "no list of mappings"
+    try:
+        profiles = parse_yaml(text or "[]", topic)
+        if isinstance(profiles, list) and all(isinstance(one, dict) for one in profiles):
+            return profiles
+    except ConfigError as error:
+        reason = str(error)
+    _log.warning("%s: its quality of service profiles are damaged (%s)", topic, reason)
+    return ()
 
 
 @lru_cache

@@ -25,7 +25,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import TypesysError, get_types_from_msg
 
 from ..core.arrays import AnyArray, Times
-from ..core.errors import BagError, ConfigError, MessageError
+from ..core.errors import BagError, MessageError
 from ..core.rows import FrequencyRows, StressRows
 from ..messages.codec import SECOND, Decoded, MessageCodec, frequency_codec, stress_codec
 from ..messages.types import FREQUENCIES, PACKAGE
@@ -85,9 +85,8 @@ DAMAGE_ERRORS = (
     sqlite3.Error,
     zstandard.ZstdError,
     TypesysError,
-    ConfigError,
 )
-"""Exceptions of the libraries, and of this package's YAML reader, for damaged files of a bag."""
+"""Exceptions of the libraries mcap, sqlite3, zstandard and rosbags for damaged files of a bag."""
 
 _log = logging.getLogger(__name__)
 

@@ -154,7 +154,11 @@ class DataSet:
                 names = AXES[: len(shape)] if len(shape) > 1 else self._names.get(key)
                 rows = values.reshape(-1, 1 if key == RESIDUAL else shape[-1])
             dtype = "image" if isinstance(values, list) else values.dtype.name
-            self._features[key] = {"dtype": dtype, "shape": shape, "names": names}
+            self._features[key] = {
+                "dtype": dtype,
+                "shape": shape,
+                "names": names,
+            }
             # Integers beside the stress (stamps, status bits) have no statistics, because policies
             # do not normalise them.
             if key in (TACTILE, RESIDUAL) or not key.startswith(TACTILE):

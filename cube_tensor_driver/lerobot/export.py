@@ -91,9 +91,22 @@ def export_lerobot(
         # continued, so it is removed.
         shutil.rmtree(partial, ignore_errors=True)
         with report_write_errors(folder):
-            data_set = DataSet(partial, skin, topics, choices.fps, frames)
+            data_set = DataSet(
+                partial,
+                skin,
+                topics,
+                choices.fps,
+                frames,
+            )
             for plan in plans:
-                _write_bag(data_set, plan, topics, depth, choices, report)
+                _write_bag(
+                    data_set,
+                    plan,
+                    topics,
+                    depth,
+                    choices,
+                    report,
+                )
             data_set.write_meta()
             partial.replace(folder)
     finally:
@@ -170,7 +183,11 @@ def _write_bag(
                 ends_ns = plan.edges_ns[block.start : block.stop]
                 columns = {key: stream.at(ends_ns) for key, stream in streams.items()}
                 data_set.write({**next(windows), **columns}, episode.task)
-                report(block.stop, len(plan.counts), f"exporting {plan.path}")
+                report(
+                    block.stop,
+                    len(plan.counts),
+                    f"exporting {plan.path}",
+                )
             data_set.end_episode(episode, plan.path.name)
     data_set.close_file()
 
@@ -199,5 +216,11 @@ def _find_stress(
         # In most data sets, the calibrations are the same throughout.
         if not noted or noted[-1]["ids"] != ids:
             since_ns = int(known.stamp_ns.min())
-            noted.append({"bag": plan.path.name, "since_ns": since_ns, "ids": ids})
+            noted.append(
+                {
+                    "bag": plan.path.name,
+                    "since_ns": since_ns,
+                    "ids": ids,
+                }
+            )
         yield plan.find_frames(known.stamp_ns), known

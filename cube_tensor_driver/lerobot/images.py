@@ -148,7 +148,17 @@ def _encode_raw(message: RawImage) -> bytes:
     # pixels need. Pillow raises a ValueError if the message has too few bytes.
     pixels = np.asarray(message.data).tobytes()
     step = int(message.step)
-    return _as_png(Image.frombuffer(mode, size, pixels, "raw", order, step, 1))
+    return _as_png(
+        Image.frombuffer(
+            mode,
+            size,
+            pixels,
+            "raw",
+            order,
+            step,
+            1,
+        )
+    )
 
 
 def _as_png(image: Image.Image) -> bytes:

@@ -197,7 +197,11 @@ class LiveWindows:
         n_cubes = len(self._level)
         depth = int(np.bincount(rows.cube).max())
         first_frame = np.zeros(len(rows), np.intp)
-        columns = arrange_windows(first_frame, rows, (1, depth, n_cubes))
+        columns = arrange_windows(
+            first_frame,
+            rows,
+            (1, depth, n_cubes),
+        )
         arrays = {name: as_column(values) for name, values in columns.items()}
         arrays[NUMBER_COLUMN] = pyarrow.array([self._number])
         batch = pyarrow.record_batch(arrays)
@@ -210,7 +214,13 @@ class LiveWindows:
         """Return the picture of the newest pressures, with the frame number at the top."""
         red = np.clip(self._level, 0.0, 1.0)
         blue = np.clip(-self._level, 0.0, 1.0)
-        colours = 255 * np.column_stack([red, np.zeros_like(red), blue])
+        colours = 255 * np.column_stack(
+            [
+                red,
+                np.zeros_like(red),
+                blue,
+            ]
+        )
         colours[np.isnan(red)] = UNKNOWN_GREY
         picture = colours.astype(np.uint8)[self._cube_at]
 

@@ -101,7 +101,14 @@ class Episode(NamedTuple):
 
     def blocks(self, length: int) -> list[range]:
         """Divide the frames into blocks of a length; the last one may be shorter."""
-        return [self.frames[k : k + length] for k in range(0, len(self.frames), length)]
+        return [
+            self.frames[k : k + length]
+            for k in range(
+                0,
+                len(self.frames),
+                length,
+            )
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +182,13 @@ def plan_bag(path: Path, choices: Choices) -> BagPlan:
                 )
             # Interval 0 lies before the first episode, and one interval follows each episode.
             first = len(edges_ns) + 1
-            episodes.append(Episode(tasks[mark], begin_ns, range(first, first + n_frames)))
+            episodes.append(
+                Episode(
+                    tasks[mark],
+                    begin_ns,
+                    range(first, first + n_frames),
+                )
+            )
             # Rounding up gives the first whole ns of each frame. A mark ends the last frame.
             steps_ns = -(-np.arange(n_frames + 1) * SECOND // fps)
             edges = np.minimum(begin_ns + steps_ns, until_ns[mark])
@@ -196,7 +209,15 @@ def plan_bag(path: Path, choices: Choices) -> BagPlan:
         "marks without a sample": sum(map(bool, tasks)) - len(episodes),
     }
     usual = float(np.median(used[used > 0])) if episodes else 0.0
-    plan = BagPlan(path, source.skin, episodes, edges_ns, used, usual, Counter(left_out))
+    plan = BagPlan(
+        path,
+        source.skin,
+        episodes,
+        edges_ns,
+        used,
+        usual,
+        Counter(left_out),
+    )
     if choices.marks is None or episodes:
         _check_rate(plan, seconds, fps)
     return plan
@@ -205,7 +226,11 @@ def plan_bag(path: Path, choices: Choices) -> BagPlan:
 def _read_samples(source: BagSource) -> Iterator[tuple[Times, Index]]:
     """Yield stamps and cube indices of all samples; the index of unknown cubes is their number."""
     n_cubes = len(source.skin.cubes)
-    for stamp_ns, cube in source.bag.columns(source.topic, frequency_codec, ("cube",)):
+    for stamp_ns, cube in source.bag.columns(
+        source.topic,
+        frequency_codec,
+        ("cube",),
+    ):
         yield stamp_ns, np.minimum(cube, n_cubes).astype(np.intp)
 
 

@@ -110,7 +110,11 @@ class Signal:
         # Row k has the numbers that hold after k messages. A JointState may contain only some of
         # the joints. The others keep their latest values, which are NaN until a message has them.
         latest = dict.fromkeys(topic.names, np.nan)
-        self._values: Single = np.full((len(messages) + 1, len(latest)), np.nan, np.float32)
+        self._values: Single = np.full(
+            (len(messages) + 1, len(latest)),
+            np.nan,
+            np.float32,
+        )
         for row, (_, numbers) in enumerate(messages, 1):
             latest |= numbers
             self._values[row] = list(latest.values())
@@ -155,7 +159,14 @@ def find_topics(paths: Sequence[Path], choices: Choices) -> list[Topic]:
                     continue
                 kind = "images" if msgtype in IMAGE_TYPES else "topics"
                 key = f"observation.{kind}.{name.strip('/').replace('/', '.')}"
-                topic = found.setdefault(name, Topic(name, msgtype, key))
+                topic = found.setdefault(
+                    name,
+                    Topic(
+                        name,
+                        msgtype,
+                        key,
+                    ),
+                )
                 if topic.msgtype != msgtype:
                     raise BagError(
                         f"{path}: {name} is {msgtype}, in other bags {topic.msgtype}; {LEAVE_OUT}"

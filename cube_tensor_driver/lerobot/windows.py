@@ -94,7 +94,11 @@ def arrange_windows(
     to_end = counts.cumsum()[cell] - np.arange(len(cell))
     place = cell // n_cubes, depth - to_end, cell % n_cubes
 
-    tactile: AnyArray = np.full((*shape, len(COMPONENTS)), np.nan, np.float32)
+    tactile: AnyArray = np.full(
+        (*shape, len(COMPONENTS)),
+        np.nan,
+        np.float32,
+    )
     tactile[place] = rows.components[order]
     windows = {TACTILE: tactile}
     for name, kind in WINDOW_COLUMNS.items():

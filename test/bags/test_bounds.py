@@ -159,3 +159,19 @@ def test_bags_that_ros2_compressed_are_read(tmp_path: Path) -> None:
     packed(tmp_path / "m" / "bag", "MESSAGE")
     with Bag(tmp_path / "m" / "bag") as opened:
         assert [one.data for one in opened.entries()] == [entry.data]
+
+
+@pytest.mark.parametrize("text", ["[7", "7", "[7]", "!!bool maybe"])
+def test_damaged_quality_of_service_counts_as_none(tmp_path: Path, caplog, text: str) -> None:
+    path = tmp_path / "b.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        schema = writer.register_schema(TEXT, "ros2msg", b"string data\n")
+        about = {"offered_qos_profiles": text}
+        writer.add_message(writer.register_channel("/text", "cdr", schema, about), 1, b"x", 1)
+        writer.finish()
+    with Bag(path) as bag:
+        assert [entry.data for entry in bag.entries()] == [b"x"]
+        assert not bag.connections[0].qos and not bag.connections[0].is_latched
+    assert "/text: its quality of service profiles are damaged" in caplog.text
