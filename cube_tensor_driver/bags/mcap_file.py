@@ -388,6 +388,7 @@ def report_parse_errors() -> Iterator[None]:
         ValueError,  # a wrong checksum, opcode or text
         KeyError,  # a channel without its schema
         OverflowError,  # an impossible length
+        MemoryError,  # an impossible length
         RuntimeError,  # damaged data, from lz4
         zstandard.ZstdError,
     ) as error:

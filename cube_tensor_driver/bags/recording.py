@@ -16,7 +16,7 @@ import numpy as np
 from ..config.skin import Skin, SkinCube, SkinLink
 from ..core.arrays import Array, Index, Times, pad_table
 from ..core.calibration import Calibration
-from ..core.errors import BagError, MessageError
+from ..core.errors import BagError, CubeError, MessageError
 from ..core.reconstructor import Reconstructor, RecordedHealth
 from ..core.rows import FrequencyRows, StressRows
 from ..core.tensor import rpy_from_quaternion
@@ -70,7 +70,8 @@ class Recording:
         for info in sorted(find_skin_infos(bag, topic), key=stamp_ns):
             try:
                 settings = read_settings(info)
-            except MessageError as error:
+                read_cube_poses(info)
+            except CubeError as error:
                 reason = error
                 bag.skip(
                     topic.replace("frequencies", "info"),

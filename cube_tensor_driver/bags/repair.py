@@ -60,6 +60,7 @@ from .mcap_file import (
 )
 from .metadata import FILE_NAME, SUFFIXES, read_metadata, write_metadata
 from .read import DAMAGE_ERRORS, check_storage_path, open_storage, report_damage
+from .sqlite_file import execute
 
 _DATED_NAME = re.compile(r"(\d+)_.*_\d{4}(_\d\d){2}-\d\d(_\d\d){2}")
 """Pattern of the name, without suffix, of a storage file that rosbag2 of ROS 2 Lyrical or newer
@@ -182,7 +183,7 @@ def _repair_file(path: Path, keep_rest: bool) -> tuple[int, int]:
         # SQLite itself rolls back an unfinished transaction at the first read of a database that is
         # opened with write permission.
         with closing(sqlite3.connect(path)) as database:
-            database.execute("SELECT count(*) FROM messages")
+            execute(database, "SELECT count(*) FROM messages")
         return 0, 0
 
 

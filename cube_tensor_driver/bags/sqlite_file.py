@@ -52,6 +52,23 @@ stores a type with every value, not per column, so damage can change the type of
 _log = logging.getLogger(__name__)
 
 
+def execute(
+    database: sqlite3.Connection,
+    sql: str,
+    values: Sequence[object] = (),
+) -> sqlite3.Cursor:
+    """Execute an SQL statement.
+
+    Raises:
+        sqlite3.Error: The database is damaged.
+    """
+    try:
+        return database.execute(sql, values)
+    except UnicodeDecodeError as error:
+        # sqlite3 cannot decode its own error message if this quotes a damaged text of the file.
+        raise sqlite3.DatabaseError(f"a text of the file is damaged ({error})") from None
+
+
 class SqliteReader:
     """An SQLite file open for reading.
 
@@ -76,9 +93,10 @@ class SqliteReader:
         )
         try:
             self.connections = self._read_connections()
-            (found,) = self._database.execute(
+            (found,) = execute(
+                self._database,
                 "SELECT min(timestamp), max(timestamp), (SELECT count(*) FROM messages)"
-                " FROM messages WHERE typeof(timestamp) = 'integer'"
+                " FROM messages WHERE typeof(timestamp) = 'integer'",
             )
         except BaseException:
             self._database.close()
@@ -118,7 +136,8 @@ class SqliteReader:
         """
         numbers = [number for number, one in self.connections.items() if one.topic in topics]
         places = ",".join("?" * len(numbers))
-        rows: Iterator[tuple[int, int, bytes]] = self._database.execute(
+        rows: Iterator[tuple[int, int, bytes]] = execute(
+            self._database,
             f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({places})"
             f" AND {_IS_SOUND} AND timestamp >= ? AND timestamp < ? ORDER BY timestamp, id",
             [*numbers, start_ns, stop_ns],
@@ -133,22 +152,25 @@ class SqliteReader:
         definitions: dict[str, str] = {}
         if self._list_columns("message_definitions"):
             definitions = dict(
-                self._database.execute(
+                execute(
+                    self._database,
                     "SELECT topic_type, CAST(encoded_message_definition AS TEXT)"
-                    " FROM message_definitions WHERE encoding = 'ros2msg'"
+                    " FROM message_definitions WHERE encoding = 'ros2msg'",
                 )
             )
         # No table states the number of messages per topic, so they are counted here. This is fast
         # compared with reading them.
         counts = dict(
-            self._database.execute(
-                f"SELECT topic_id, count(*) FROM messages WHERE {_IS_SOUND} GROUP BY topic_id"
+            execute(
+                self._database,
+                f"SELECT topic_id, count(*) FROM messages WHERE {_IS_SOUND} GROUP BY topic_id",
             )
         )
         qos_column = "CAST(offered_qos_profiles AS TEXT)" if has_qos else "''"
-        topics = self._database.execute(
+        topics = execute(
+            self._database,
             f"SELECT id, name, type, {qos_column} FROM topics"
-            " WHERE typeof(name) = 'text' AND typeof(type) = 'text'"
+            " WHERE typeof(name) = 'text' AND typeof(type) = 'text'",
         )
         return {
             number: Connection(
@@ -163,7 +185,7 @@ class SqliteReader:
 
     def _list_columns(self, table: str) -> set[str]:
         """Return the names of a table's columns; an empty set if the table does not exist."""
-        return {row[1] for row in self._database.execute(f"PRAGMA table_info({table})")}
+        return {row[1] for row in execute(self._database, f"PRAGMA table_info({table})")}
 
 
 class SqliteWriter:
