@@ -148,7 +148,12 @@ class DataSet:
                 few = pixels[::PIXEL_STRIDE, ::PIXEL_STRIDE]
                 # LeRobot normalises images of the shape (bands, height, width), to which statistics
                 # of the shape (bands, 1, 1) are broadcast.
-                rows: AnyArray = few.reshape(-1, shape[2], 1, 1)
+                rows: AnyArray = few.reshape(
+                    -1,
+                    shape[2],
+                    1,
+                    1,
+                )
             else:
                 shape = values.shape[1:]
                 names = AXES[: len(shape)] if len(shape) > 1 else self._names.get(key)
@@ -232,7 +237,11 @@ class DataSet:
         }
         statistics = {key: summarise(parts, self._frames) for key, parts in self._parts.items()}
         for name, value in (("info", info), ("stats", statistics)):
-            text = json.dumps(value, indent=4, ensure_ascii=False)
+            text = json.dumps(
+                value,
+                indent=4,
+                ensure_ascii=False,
+            )
             (meta / f"{name}.json").write_text(text + "\n", encoding="utf-8")
 
 

@@ -119,7 +119,11 @@ class LiveWindows:
         self._folder = folder
         self._source = source
         self._full_scale = full_scale
-        self._cube_at = nearest_cubes(source.skin, width, height)
+        self._cube_at = nearest_cubes(
+            source.skin,
+            width,
+            height,
+        )
         self._level = np.full(len(source.skin.cubes), np.nan)
         self._number = 0
         self._writer: pyarrow.ipc.RecordBatchStreamWriter | None = None
@@ -227,7 +231,11 @@ class LiveWindows:
         number_bytes = self._number.to_bytes(NUMBER_BYTES, "big")
         bits = np.unpackbits(np.frombuffer(number_bytes, np.uint8))
         side = picture.shape[1] // NUMBER_GRID[1]
-        square = np.full((MIN_SQUARE, side), 255, np.uint8)
+        square = np.full(
+            (MIN_SQUARE, side),
+            255,
+            np.uint8,
+        )
         squares = np.kron(bits.reshape(NUMBER_GRID), square)
         rows, columns = squares.shape
         picture[:rows, :columns] = squares[..., np.newaxis]
@@ -295,7 +303,12 @@ def frame_number(picture: AnyArray) -> int:
     rows, columns = NUMBER_GRID
     side = grey.shape[1] // columns
     strip = grey[: rows * MIN_SQUARE, : columns * side]
-    by_square = strip.reshape(rows, MIN_SQUARE, columns, side)
+    by_square = strip.reshape(
+        rows,
+        MIN_SQUARE,
+        columns,
+        side,
+    )
     squares = by_square.mean(axis=(1, 3))
     # Pixels may be scaled to 0 to 1 or 0 to 255. Every frame number has black and white squares, so
     # the threshold is half way between the darkest and the brightest one.

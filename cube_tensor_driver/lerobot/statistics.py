@@ -9,7 +9,6 @@ parts, so that they need not be in memory together.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -32,24 +31,9 @@ computed from rows that are chosen at random.
 """
 
 
-class Part(NamedTuple):
-    """Description of some rows of a feature; each array has the shape of one row.
-
-    Attributes:
-        known: Number of known values.
-        mean: Mean of the known values; 0 if there is none.
-        variance: Variance of the known values; 0 if there is none.
-        low: Lowest known value; infinity if there is none.
-        high: Highest known value; minus infinity if there is none.
-        sample: (M, …) some of the rows, for the quantiles.
-    """
-
-    known: AnyArray
-    mean: Array
-    variance: Array
-    low: Array
-    high: Array
-    sample: Array
+Part = tuple[Array, Array]
+"""Description of some rows of a feature: count, mean, variance, minimum and maximum of the known
+values (5, …), and some of the rows (M, …), for the quantiles."""
 
 
 def describe(rows: AnyArray, is_chosen: Mask) -> Part:
@@ -57,17 +41,17 @@ def describe(rows: AnyArray, is_chosen: Mask) -> Part:
 
     Args:
         rows: (n, …) values, n at least 1. NaN and infinite values are unknown.
-        is_chosen: (n,) whether each row enters the sample for the quantiles.
+        is_chosen: (n,) whether each row is kept for the quantiles.
     """
     values = np.ma.masked_invalid(rows.astype(np.float64))
-    return Part(
+    described = [
         values.count(axis=0),
         values.mean(axis=0).filled(0),
         values.var(axis=0).filled(0),
         values.min(axis=0).filled(np.inf),
         values.max(axis=0).filled(-np.inf),
-        values[is_chosen].filled(np.nan),
-    )
+    ]
+    return np.array(described), values[is_chosen].filled(np.nan)
 
 
 def summarise(parts: Sequence[Part], frames: int) -> dict[str, list[object]]:
@@ -84,8 +68,8 @@ def summarise(parts: Sequence[Part], frames: int) -> dict[str, list[object]]:
     Returns:
         Lists of the shape of a row for each statistic, by its name in LeRobot.
     """
-    *columns, samples = zip(*parts, strict=True)
-    count, means, variances, lows, highs = map(np.stack, columns)
+    described, samples = zip(*parts, strict=True)
+    count, means, variances, lows, highs = np.stack(described, axis=1)
     total = count.sum(axis=0)
     is_empty = total == 0
     weight = count / np.maximum(total, 1)
@@ -101,7 +85,11 @@ def summarise(parts: Sequence[Part], frames: int) -> dict[str, list[object]]:
     is_sampled = np.isfinite(sample).any(axis=0)
     substitute = np.where(is_sampled, np.nan, mean)
     known = np.concatenate([sample, substitute[np.newaxis]])
-    quantiles = np.nanquantile(known, list(QUANTILES.values()), axis=0)
+    quantiles = np.nanquantile(
+        known,
+        list(QUANTILES.values()),
+        axis=0,
+    )
     statistics = {
         "min": np.where(is_empty, 0, lows.min(axis=0)),
         "max": np.where(is_empty, 0, highs.max(axis=0)),

@@ -88,7 +88,11 @@ class Topic:
         be larger than the memory.
         """
         if self.is_image:
-            return ImageStream(bag, self.name, self.shape)
+            return ImageStream(
+                bag,
+                self.name,
+                self.shape,
+            )
         return Signal(bag, self)
 
 
@@ -143,7 +147,11 @@ def find_topics(paths: Sequence[Path], choices: Choices) -> list[Topic]:
     """
     found: dict[str, Topic] = {}
     existing: set[str] = set()
-    named = [*(choices.topics or ()), choices.state, choices.action]
+    named = [
+        *(choices.topics or ()),
+        choices.state,
+        choices.action,
+    ]
     wanted = {topic for topic in named if topic}
     for path in paths:
         with Bag(path) as bag:
@@ -270,6 +278,10 @@ def _find_joint_numbers(message: JointState, where: str) -> dict[str, float]:
                 f"{where}: a message has {len(joints)} joints and {len(values)} values of "
                 f"{quantity}; {LEAVE_OUT}"
             )
-        for joint, value in zip(joints, values, strict=False):
+        for joint, value in zip(
+            joints,
+            values,
+            strict=False,
+        ):
             numbers[f"{joint}.{quantity}"] = float(value)
     return numbers

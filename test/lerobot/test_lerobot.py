@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet
 import pytest
-from bag_maker import START_NS, header, make_bag, message
+from bag_maker import START_NS, frequencies_of, header, make_bag, message
 from PIL import Image
 
 from cube_tensor_driver.bags.metadata import make_typestore
@@ -373,6 +373,24 @@ def test_a_bag_without_frequencies_is_refused_in_one_line(tmp_path, capsys):
     assert main([*command, "--fps", "30"]) == 1
     assert "record frequencies and info" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_message_that_does_not_fit_the_skin_is_left_out(tmp_path):
+    """The samples that were counted in it do not arrive; all others are written."""
+    plain = make_bag(tmp_path / "plain", SKIN, 60)
+    at_ns = START_NS + 200_000_001
+    less = frequencies_of(99, at_ns, np.full((16, 7), 1e5))
+    bag = with_others(plain, tmp_path / "bag", [("/frequencies", at_ns, less)])
+    frames = []
+    for path in (plain, bag):
+        out = tmp_path / f"{path.name}_set"
+        assert main(["export", "lerobot", str(path), "-o", str(out), "--fps", "30"]) == 0
+        frames.append(read_frames(out))
+    expected, found = frames
+    for name, values in expected.items():
+        # The windows of the bag have room for what was counted. Each has at least 3 samples.
+        newest = slice(-3, None) if values.ndim > 2 else slice(None)
+        np.testing.assert_array_equal(found[name][:, newest], values[:, newest], name)
 
 
 def test_a_clock_that_was_set_is_refused(tmp_path, capsys):
