@@ -9,19 +9,18 @@
 /* device/clock and device/track.py define the same constants and give the reasons for the values. */
 #define MAX_DEVICE_US ((uint64_t)1 << 51)
 #define MIN_STEP_US 4000.0
-#define PERIOD_TOLERANCE 1e-3
 #define PERIOD_SAMPLES 64
 #define JITTER_POINTS 64
 #define MAX_DELAY_NS 60000000000
 #define MAX_PAUSE_NS 60000000000
 
-/* Updates the estimate of the sample period, as `find_step` in device/clock/steps.py does. Returns
- * false if the device time deviates from what this period predicts. */
+/* Updates the estimate of the sample period, as `HubClock._find_step` does. Returns false if the
+ * device time deviates from what this period predicts. */
 static bool follow_period(cube_track_head *track, const cube_sample *sample) {
     uint32_t n_periods = sample->sequence - (uint32_t)track->reference;
     double interval = (double)((int64_t)sample->device_us - track->reference_us);
     double error = interval - n_periods * track->period_us;
-    if (fabs(error) > MIN_STEP_US + PERIOD_TOLERANCE * n_periods * track->period_us)
+    if (fabs(error) > MIN_STEP_US)
         return false;
     double bound = track->period_us / PERIOD_SAMPLES;
     track->period_us += fmin(fmax(error, -bound), bound) / PERIOD_SAMPLES;
@@ -35,16 +34,13 @@ static bool follow_period(cube_track_head *track, const cube_sample *sample) {
  * first after a second of points, of which the earliest is then added. */
 static bool follow_line(
     cube_track_head *track, int64_t device_ns, int64_t arrival_ns, bool is_late) {
-    double delay = (double)(arrival_ns - device_ns);
-    double height = delay - track->offset - track->drift * (double)device_ns;
+    double height = (double)(arrival_ns - device_ns) - track->offset - track->drift * (double)device_ns;
     if (!(height >= 0) || (double)arrival_ns >= track->bucket_end)
         return false;
     track->jitter_ns += (height - track->jitter_ns) / JITTER_POINTS;
-    if (height < track->bucket_height) {
+    if (height < track->bucket_height && !is_late) {
         track->bucket_height = height;
         track->earliest_ns = (double)device_ns;
-        track->earliest_delay = delay;
-        track->is_earliest_late = is_late;
     }
     return true;
 }

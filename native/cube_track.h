@@ -23,10 +23,9 @@ typedef struct {
     int64_t reference, reference_us;
     int64_t first_us, first_ns;
     int64_t newest_ns, last_arrival_ns, last_stamp_ns;
-    int64_t is_earliest_late;
     double period_us;
     double offset, bounded_offset, drift, jitter_ns;
-    double bucket_end, bucket_height, earliest_ns, earliest_delay;
+    double bucket_end, bucket_height, earliest_ns;
 } cube_track_head;
 
 typedef struct {

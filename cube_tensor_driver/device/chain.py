@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 from ..core.errors import LinkError
 from ..core.rows import FrequencyRows
 from ..core.status import STAMP
+from .clock.host_clock import HostClockWatch
 from .clock.hub_clock import HubClock
-from .clock.steps import HostClockWatch
 from .links.intake import NO_SAMPLES, NativeSamples
 from .links.link import Link, LinkConfig, LinkState
 from .links.link_log import LinkLogger, Log

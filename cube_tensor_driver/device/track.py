@@ -59,7 +59,6 @@ class LinkTrack(Structure):
         newest_ns: Newest device time, in ns; `NEVER` before the first sample.
         last_arrival_ns: Host time of the last arrival, in ns since the Unix epoch.
         last_stamp_ns: Last stamp (host time of sampling) that was given, in ns since the epoch.
-        is_earliest_late: Whether the host read the point with the height `bucket_height` late.
         period_us: Estimated sample period, in µs; 0 if it is not known.
         offset: Arrival minus device time on the clock line at device time 0, in ns.
         bounded_offset: `offset` without the smallest delay, as far as this delay is known, in ns.
@@ -68,7 +67,6 @@ class LinkTrack(Structure):
         bucket_end: Arrival time, in ns, at which the present second (bucket) ends.
         bucket_height: Smallest height above the line in this bucket, in ns; infinite if none.
         earliest_ns: Device time of the point with the height `bucket_height`, in ns.
-        earliest_delay: Arrival minus device time of the same point, in ns.
         seen: Number and device time, in µs, of the newest samples; the place of number n is n % 64.
     """
 
@@ -85,7 +83,6 @@ class LinkTrack(Structure):
     newest_ns: int
     last_arrival_ns: int
     last_stamp_ns: int
-    is_earliest_late: bool
     period_us: float
     offset: float
     bounded_offset: float
@@ -94,7 +91,6 @@ class LinkTrack(Structure):
     bucket_end: float
     bucket_height: float
     earliest_ns: float
-    earliest_delay: float
     seen: list[Any]
 
     _fields_ = tuple((name, _TYPES[kind]) for name, kind in __annotations__.items())

@@ -106,6 +106,32 @@ def test_a_hub_that_samples_late_has_not_set_its_clock(delay, pause_s) -> None:
     assert delay is not quick or not run.in_doubt.any()
 
 
+@pytest.mark.parametrize("seed", [6, 8])
+def test_a_slow_hub_that_samples_early_has_not_set_its_clock(seed) -> None:
+    """At 5 Hz, the delays of the samples of 0.2 s may all be as long as the step."""
+    true_s = np.arange(200) / 5
+    true_s -= np.where(true_s >= AT_S, 0.005, 0)
+    run = Run(random_delays, true_s, device_times(true_s), seed)
+    assert not run.named.any() and run.in_doubt.sum() <= 8
+
+
+def test_one_sample_that_is_late_is_not_two_steps() -> None:
+    true_s = np.arange(2000) / 100
+    true_s[1000] += 0.005
+    device_us = device_times(true_s)
+    run = Run(usb_bursts, true_s, device_us, seed=1)
+    assert not run.named.any() and run.in_doubt.sum() <= 2
+
+
+@pytest.mark.parametrize("late_s", [1.0, 2.5])
+def test_delays_that_are_longer_for_a_second_are_not_a_step(late_s) -> None:
+    """For two seconds they are, and a step that is over again is the second one."""
+    true_s = np.arange(2000) / 100
+    delay_s = np.where((true_s > AT_S) & (true_s < AT_S + late_s), 0.05, 0)
+    run = Run(lambda t, _: t + BASE_S + delay_s, true_s, device_times(true_s), seed=1)
+    assert run.clock.resets == (0 if late_s < 2 else 2)
+
+
 def test_loss_disorder_gaps_and_the_wrap_of_numbers_raise_no_doubt() -> None:
     """Samples lost one by one and for seconds, sent twice, and behind the one that follows."""
     random = np.random.default_rng(4)

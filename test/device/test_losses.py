@@ -5,6 +5,7 @@ and a restart."""
 
 from __future__ import annotations
 
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -46,6 +47,8 @@ class OneLink:
         cubes = [CubeAddress(f"c{index}", 0, index, None, 2) for index in range(n_cubes)]
         self.live = LiveLinks([LinkConfig("a", "/dev/none")], cubes, self._keep)
         self.live.start()
+        while self.live._reader.links[0].state is LinkState.CLOSED:
+            time.sleep(1e-3)  # its change of state must not come between the frames
         self.lag_s = 0.0  # not that of this machine, which may be busy
         self.live._reader.take_lag_s = lambda: self.lag_s
         self.arrival_ns = EPOCH_NS

@@ -123,3 +123,18 @@ def test_answers_that_contradict_the_samples_are_named_and_not_used() -> None:
             clock.add_answer(arrival_ns, wrong_us, arrival_ns + 1000)
         assert abs(stamp_ns - arrival_ns) < 1_000_000
     assert clock.problems == {BAD_ANSWERS} and clock.resets == 0
+
+
+def test_bounds_that_answers_contradict_are_forgotten() -> None:
+    """The hub's time in the answers is 10 ms ahead at first. All samples have 20 ms of delay."""
+    clock = HubClock()
+    for k in range(2000):
+        true_ns = EPOCH_NS + 10_000_000 * k
+        clock.update([10_000 * k], true_ns + 20_000_000, [k])
+        if k % 100 == 0:
+            asked_us = 10_000 * k + (10_000 if k < 1000 else 0)
+            clock.add_answer(true_ns - 1_000_000, asked_us, true_ns + 1_000_000)
+        if k == 1250:
+            assert clock.problems == {BAD_ANSWERS} and clock.line.error_bound is None
+    (stamp_ns,) = clock.update([20_000_000], EPOCH_NS + 20_020_000_000, [2000])
+    assert abs(stamp_ns - EPOCH_NS - 20_000_000_000) < 100_000

@@ -1,46 +1,46 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Conversion of one hub's device times to host times.
+"""Conversion of one hub's device times to host times (stamps).
 
-Host time is a straight line over device time (`line.py`). Round trips (a question for the hub's
-time and its answer) bound the error of the line, and it is restarted after a step of the hub's
-clock, which `steps.py` finds. Device times of a clock that stands still or jumps again and again
-cannot be converted; then the stamp (host time) of a row is its arrival time.
+Host time is a straight line over device time (`line.py`). Both are counted from the first sample,
+because a float would round absolute times to 256 ns. A hub takes one sample in each period and
+numbers it, so a device time that deviates from this may be a step of the hub's clock. Then the
+origin of device times moves with it, once the delays of the next samples show that the hub did not
+just sample late. While a clock stands still or keeps stepping, stamps are arrivals.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import replace
 
-from ..track import MAX_DEVICE_US, NEVER, RESTART_US, LinkTrack
-from .line import ClockLine, ClockRoundTrip
-from .steps import MAX_DECISION_NS, StepDecision, find_step
+from ...core.rows import COUNTER_RANGE
+from ..track import MAX_DEVICE_US, NEVER, LinkTrack
+from .line import MAX_DELAY_NS, ClockLine
 
-MAX_DELAY_NS = 60_000_000_000
-"""Longest credible delay, in ns, between the sampling of a sample and its arrival. If the estimated
-time of sampling is further before the arrival, the arrival time is the stamp of the sample."""
 MAX_PAUSE_NS = 60_000_000_000
-"""Longest pause, in ns, between two reads of a hub's samples after which the clock line (host time
-over device time) is still used. A pause is longer only if it is so by both the hub's and the host's
-clock. Then the error of the drift, up to 6 ms per minute, would look like a step of the hub's
-clock. So the line is begun anew, and only its drift is kept."""
-MIN_STILL_NS = 200_000_000
-"""Time, in ns, for which the device times (hub's clock) of samples must stay the same before the
-hub's clock counts as standing still. `MIN_STILL_READS` must be reached, too."""
-MIN_STILL_READS = 3
-"""Number of successive reads with an unchanged device time (hub's clock) before this clock counts
-as standing still. One is not enough, because two reads may give two frames of one sample."""
+"""Longest pause, in ns, by both clocks, over which the line is continued. After a longer one, the
+error of the drift, up to 6 ms per minute, would look like a step."""
+MIN_STEP_US = 4000.0
+"""Smallest deviation, in µs, of a device time from the sample period at which a step is suspected.
+Steps of 5 ms shall be found; 1 ms is left for the jitter of the hub."""
+PERIOD_SAMPLES = 64
+"""Time constant, in samples, of the low-pass filter that estimates the sample period."""
+DECISION_NS = 200_000_000
+"""Time, in ns, after a suspected step for which delays are collected to decide about it."""
+MIN_DECISION_READS = 8
+"""Number of reads after a suspected step that are needed: the delays of fewer may all be long."""
+UNLIKELY_DELAY = 16.0
+"""Ratio of a step to the mean delay above which one delay decides: hardly any delay exceeds the
+mean by half of this factor."""
 MAX_STEPS = 3
-"""Number of steps of a hub's clock within `STEPS_NS` (10 s) from which on its times are not used.
-Then the arrival times at the host are the stamps of the samples."""
+"""Number of steps within `STEPS_NS` from which on a hub's clock is not used."""
 STEPS_NS = 10_000_000_000
-"""Length, in ns, of the time window in which the steps of a hub's clock are counted. Older steps do
-not count, so that the clock is used again after some time without steps."""
+"""Length, in ns, of the time window in which steps are counted."""
 MAX_BAD_ANSWERS = 3
-"""Number of successive answers to the request TIME (for the hub's time) that must contradict the
-device times of the hub's samples before the contradiction is reported as a problem."""
+"""Number of successive answers to TIME that contradict the samples or earlier answers before this
+is reported and the earlier answers are forgotten."""
 CLOCK_SET = "the hub's clock was set: stamps follow its new time"
 """Problem that is reported after a step of the hub's clock."""
 CLOCK_STANDS_STILL = "the hub's clock stands still: rows are stamped by their arrival"
@@ -55,342 +55,228 @@ BAD_ANSWERS = "the hub's answers to TIME contradict its samples: they are not us
 
 
 class HubClock:
-    """Converts the device times of one hub to host times (stamps).
-
-    It needs bounded memory and constant time per sample.
+    """Converts the device times of one hub to host times.
 
     Attributes:
         resets: Number of restarts of the hub plus number of detected steps of a clock.
-        in_doubt: Whether the stamps of the last `update` may be wrong, because the hub's clock may
-            have been set or cannot be used.
+        in_doubt: Whether the stamps of the last `update` may be wrong.
         problems: Texts of problems, which the caller reports and removes.
         track: Sample numbers and clock values of the hub, which the module in C changes, too.
         line: The straight line from device times to host times.
     """
 
-    # Times are stored relative to track.first_us (device) and track.first_ns (host), because a
-    # float would round absolute times to 256 ns.
-
     def __init__(self, track: LinkTrack | None = None) -> None:
         self.track = track or LinkTrack()
-        self.resets = 0
-        self.in_doubt = False
+        self.track.last_arrival_ns = self.track.last_stamp_ns = NEVER
+        self.resets = self._n_bad_answers = 0
+        self.in_doubt = self._is_still = False
         self.problems: set[str] = set()
         self.line = ClockLine(self.track)
-        self._is_late = False  # whether the samples of the last update were read late
-        self._last_us = -1  # newest device time, in µs, in the last read
-        self._moved_ns = 0  # arrival time at which _last_us changed last
-        self._n_still = 0  # number of reads since _last_us changed
-        self._steps_ns: deque[int] = deque(maxlen=MAX_STEPS)
-        self._n_bad_answers = 0
-        self.track.last_arrival_ns = NEVER
-        self.track.last_stamp_ns = NEVER
-        # Last stamp that was given while a step of the hub's clock was only suspected, if the step
-        # was confirmed later. The stamp was computed without the step and may be too late.
-        self._doubtful_stamp = NEVER
+        self._step_us = 0  # suspected step of the hub's clock; 0 if none is
+        self._steps_ns: deque[int] = deque(maxlen=MAX_STEPS)  # arrivals after the newest steps
+        self._doubtful_stamp = NEVER  # last stamp before a step was certain, maybe too late by it
         self._restart()
 
     @property
     def is_steady(self) -> bool:
-        """Whether the hub's clock runs regularly, so that the module in C may convert its times.
-
-        The sample period must be known up to the newest sample, and no step of the clock suspected.
-        """
+        """Whether nothing is in doubt, so that the module in C may convert the next samples."""
         track = self.track
         is_newest = 1000 * (track.newest_us - track.first_us) == track.newest_ns
-        in_step = is_newest and track.reference_us == track.newest_us and track.period_us > 0
-        is_suspected = self.in_doubt or self._decision is not None or self._n_still > 0
-        return in_step and not is_suspected and len(self._steps_ns) < MAX_STEPS
+        is_period_known = track.reference_us == track.newest_us and track.period_us > 0
+        return is_newest and is_period_known and not self.in_doubt
 
     @property
     def offset_ns(self) -> int:
-        """Host time minus hub's time at the newest sample, in ns; 0 before the first sample."""
-        if self._is_fresh:
-            return 0
+        """Host time minus device time at the newest sample, in ns; 0 before the first sample."""
         track = self.track
-        between_origins = track.first_ns - 1000 * track.first_us
+        if track.newest_ns == NEVER:
+            return 0
         since_origins = track.bounded_offset + track.drift * track.newest_ns
-        return between_origins + round(since_origins)
+        return track.first_ns - 1000 * track.first_us + round(since_origins)
 
     def reset(self) -> None:
-        """Discard the line (host time over device time) and its samples, because the hub restarted.
-
-        The drift is kept as a first guess. Later stamps are still not earlier than the last one.
-        """
-        self._count_reset()
+        """Discard the line and its points, because the hub restarted; keep the drift."""
+        self._count_step()
         self._restart()
 
     def shift(self, step_ns: int) -> None:
-        """Move all stored host times by the step by which the host's clock was set.
-
-        Args:
-            step_ns: New time minus old time of the host's clock, in ns.
-        """
+        """Move all stored host times by the step, in ns, by which the host's clock was set."""
         self.track.first_ns += step_ns
-        self._moved_ns += step_ns
-        self._steps_ns = deque((at + step_ns for at in self._steps_ns), MAX_STEPS)
-        if self.track.last_arrival_ns != NEVER:
-            self.track.last_arrival_ns += step_ns
-        if self.track.last_stamp_ns != NEVER:
-            self.track.last_stamp_ns += step_ns
-            self._doubtful_stamp += step_ns
+        self.track.last_arrival_ns += step_ns
+        self.track.last_stamp_ns += step_ns
 
     def add_answer(self, sent_ns: int, device_us: int, arrival_ns: int) -> None:
-        """Bound the offset (host time minus device time) by one question and its answer.
+        """Bound the offset by one question for the hub's time and its answer.
 
-        The host's clock must not have been set between the two. Without samples, or while stamps
-        are in doubt, the answer is not used.
+        Without samples, or while stamps are in doubt, the answer is not used.
 
         Args:
-            sent_ns: Host time at which the hub was asked for its time, in ns.
+            sent_ns: Host time at which the hub was asked.
             device_us: Device time in the answer, in µs.
-            arrival_ns: Host time at which the answer arrived, in ns.
+            arrival_ns: Host time at which the answer arrived.
         """
-        if self._is_fresh or self.in_doubt or not sent_ns <= arrival_ns:
+        if self.track.newest_ns == NEVER or self.in_doubt or sent_ns > arrival_ns:
             return
         device_ns = 1000.0 * (device_us - self.track.first_us)
-        since_first = -self.track.first_ns - device_ns
-        trip = ClockRoundTrip(device_ns, sent_ns + since_first, arrival_ns + since_first)
-        if self.line.add_round_trip(trip):
-            self._n_bad_answers = 0
-            return
-        self._n_bad_answers += 1
+        sent = sent_ns - self.track.first_ns
+        is_good = self.line.add_round_trip(device_ns, sent, arrival_ns - self.track.first_ns)
+        self._n_bad_answers = 0 if is_good else self._n_bad_answers + 1
         if self._n_bad_answers >= MAX_BAD_ANSWERS:
             self.problems.add(BAD_ANSWERS)
+            self.line.forget_round_trips()
 
     def update(
         self,
         device_us: Sequence[int],
         arrival_ns: int,
-        numbers: Sequence[int] = (),
+        numbers: Sequence[int],
         is_late: bool = False,
     ) -> list[int]:
-        """Convert the device times of samples that arrived together to host times (stamps).
+        """Fit the line to samples that arrived together, and convert their device times.
 
-        The clock line (host time over device time) is first fitted to the samples. Stamps never
-        decrease with increasing device time, unless the host's clock was set back, and no stamp is
-        later than the arrival.
+        Stamps never decrease with increasing device time, and no stamp is later than the arrival.
 
         Args:
             device_us: Device times of the samples, in µs.
-            arrival_ns: Host time at which the samples arrived, in ns.
-            numbers: Numbers of the samples. Without numbers, a step of the hub's clock is found
-                later, and small steps back are not found.
-            is_late: Whether this host reads the samples late, because it is too slow. Then their
-                delays are not used to find steps of a clock.
+            arrival_ns: Host time at which the samples arrived.
+            numbers: Numbers of the samples.
+            is_late: Whether this host is too slow and reads the samples late.
 
         Returns:
             Stamp (host time) of each sample, in ns.
         """
         self.in_doubt = False
-        self._is_late = is_late
-        device_us = [min(time_us, MAX_DEVICE_US) for time_us in device_us]
+        times = [min(time_us, MAX_DEVICE_US) for time_us in device_us]
         stamps: list[int] = []
         start = 0
         for k, number in enumerate(numbers):
-            step_us = find_step(self.track, number, device_us[k])
-            if not step_us:
-                continue
-            # Samples before a step of the hub's clock are converted by the line before the step.
-            stamps += self._convert(device_us[start:k], arrival_ns)
-            start = k
-            if not self._is_fresh:
-                self._begin_decision(step_us, arrival_ns)
-        return stamps + self._convert(device_us[start:], arrival_ns)
-
-    @property
-    def _is_fresh(self) -> bool:
-        """Whether no sample has come since the start or the last restart of the hub."""
-        return self.track.newest_ns == NEVER
+            step_us = self._find_step(number, times[k])
+            # While the hub's clock stands still, samples do not become the reference.
+            self._is_still = step_us != 0 and self.track.reference != number
+            if step_us and not self._is_still:
+                # Samples before a step are converted without it.
+                stamps += self._convert(times[start:k], arrival_ns, is_late)
+                start = k
+                # If an earlier step is undecided, the sum of both is decided.
+                step_us += self._step_us
+                self._step_us = step_us if abs(step_us) > MIN_STEP_US else 0
+                self._min_height = math.inf
+                self._since_ns = arrival_ns
+                self._n_reads = 0
+        return stamps + self._convert(times[start:], arrival_ns, is_late)
 
     def _restart(self) -> None:
-        """Discard the clock line and all samples; keep the drift and the last stamp (host time)."""
-        self.track.first_us = self.track.first_ns = 0
+        """Discard the line and all samples; keep the drift and the last stamp."""
         self.track.newest_ns = NEVER
         self.track.reference = -1
         self.track.period_us = 0.0
         self.line.restart()
-        self._decision: StepDecision | None = None
+        self._step_us = 0
 
-    def _count_reset(self) -> None:
-        """Count a restart of the hub or a step of a clock.
-
-        The time of the event is kept, to find a clock that is set again and again.
-        """
+    def _count_step(self, *problems: str) -> None:
+        self.problems.update(problems)
         self.resets += 1
         self._steps_ns.append(self.track.last_arrival_ns)
 
-    def _convert(self, times: Sequence[int], arrival_ns: int) -> list[int]:
-        """Fit the clock line to the newest of some samples, and convert the device times of all.
-
-        The clock line states host time as a linear function of device time (the hub's clock).
-
-        Args:
-            times: Device times of samples that arrived together, in µs.
-            arrival_ns: Host time at which they arrived, in ns.
-
-        Returns:
-            Stamp (host time) of each sample, in ns.
-        """
-        if not times:
-            return []
+    def _find_step(self, number: int, device_us: int) -> int:
+        """Return the deviation of a device time, in µs, if it may be a step; else 0."""
         track = self.track
-        # The clock line is determined by the smallest delays. Of samples that arrive together, only
-        # the newest one can have the smallest delay.
-        is_usable = self._learn(max(times), arrival_ns)
-        offset = track.bounded_offset
-        drift = track.drift
-        stamps = []
-        for time_us in times:
-            device_ns = 1000 * (time_us - track.first_us)
-            stamp = track.first_ns + device_ns + round(offset + drift * device_ns)
-            if not is_usable or not 0 <= arrival_ns - stamp <= MAX_DELAY_NS:
-                stamp = arrival_ns
-            # Stamps must be in the order of the device times, so a sample that came out of order
-            # must not get a later stamp than the newest one.
-            if device_ns <= track.newest_ns and is_usable:
-                stamp = min(stamp, track.last_stamp_ns)
-            else:
-                track.newest_ns = max(device_ns, track.newest_ns)
-                if stamp < track.last_stamp_ns:
-                    self.in_doubt |= stamp < self._doubtful_stamp
-                    stamp = track.last_stamp_ns
-                track.last_stamp_ns = stamp
-            stamps.append(stamp)
-        return stamps
+        interval = device_us - track.reference_us
+        n_periods = (number - track.reference) % COUNTER_RANGE
+        is_step = False
+        if track.reference >= 0:
+            if not 0 < n_periods < COUNTER_RANGE // 2:
+                return 0  # The sample came out of order, or is another frame of the same sample.
+            period = track.period_us
+            error = interval - n_periods * period
+            is_step = abs(error) > MIN_STEP_US and (period > 0.0 or interval < 0)
+            if period <= 0.0:
+                track.period_us = max(0.0, interval / n_periods)
+            elif not is_step:
+                # The change is limited, or a clock that stands still would shorten the period.
+                bound = period / PERIOD_SAMPLES
+                track.period_us += min(max(error, -bound), bound) / PERIOD_SAMPLES
+        # While the clock stands still, the reference is kept, so that the deviation grows.
+        if interval or track.reference < 0:
+            track.reference = number
+            track.reference_us = device_us
+        return round(error) if is_step else 0
 
-    def _learn(self, newest_us: int, arrival_ns: int) -> bool:
-        """Fit the clock line to a new sample, and look for steps of the hub's clock.
+    def _decide(self, height: float, arrival_ns: int) -> None:
+        """Decide whether the clock was set or the hub sampled late, if heights show it by now."""
+        self._n_reads += 1
+        self._min_height = min(self._min_height, height)
+        step_ns = 1000 * self._step_us
+        # The smallest height is 0 if the hub sampled late, and -step_ns if its clock was set.
+        # Below the middle only the lower of the two is possible.
+        is_low = self._min_height < -step_ns / 2
+        is_long = abs(step_ns) > UNLIKELY_DELAY * self.track.jitter_ns
+        is_old = arrival_ns - self._since_ns >= DECISION_NS and self._n_reads >= MIN_DECISION_READS
+        if not (is_low or is_long or is_old):
+            return
+        self._step_us = 0
+        if is_low != (step_ns > 0):
+            self.track.period_us = 0.0  # The hub sampled late, maybe with another period.
+            return
+        # The origin of device times moves with the clock, so that the line stays valid.
+        self.track.first_us += step_ns // 1000
+        self.track.newest_ns -= max(0, step_ns)
+        self._doubtful_stamp = self.track.last_stamp_ns
+        self._count_step(CLOCK_SET)
 
-        The clock line states host time as a linear function of device time (the hub's clock).
-
-        Args:
-            newest_us: Device time of the sample, in µs; the newest one of those that arrived
-                together.
-            arrival_ns: Host time at which it arrived, in ns.
-
-        Returns:
-            Whether device times of this hub can be converted now.
-        """
+    def _learn(self, newest_us: int, arrival_ns: int, is_late: bool) -> bool:
+        """Fit the line to the newest of some samples, and return whether it can be used."""
         track = self.track
-        goes_back = arrival_ns < track.last_arrival_ns
-        pause_ns = min(
-            arrival_ns - track.last_arrival_ns,
-            1000 * (newest_us - track.first_us) - track.newest_ns,
-        )
+        pause_ns = arrival_ns - track.last_arrival_ns
+        device_pause_ns = 1000 * (newest_us - track.first_us) - track.newest_ns
         track.last_arrival_ns = arrival_ns
-        if goes_back:
-            # Host time went back without a reported step of the host's clock: the step was missed,
-            # or a simulated time was restarted.
+        if pause_ns < 0:
+            # The step of the host's clock was missed, or a simulated time was restarted.
             track.last_stamp_ns = NEVER
             self.reset()
-        elif pause_ns > MAX_PAUSE_NS and not self._is_fresh:
+        elif min(pause_ns, device_pause_ns) > MAX_PAUSE_NS and track.newest_ns != NEVER:
             self._restart()
-
-        problem = self._find_problem(newest_us, arrival_ns)
-        if problem:
-            self.problems.add(problem)
-            self._decision = None
-        elif self._decision is not None and not self._n_still:
-            self._decide(self._decision, newest_us, arrival_ns)
-
-        device_ns = 1000 * (newest_us - track.first_us)
-        if device_ns + 1000 * RESTART_US < track.newest_ns:
-            self.reset()
         if track.newest_ns == NEVER:
             track.first_us = newest_us
             track.first_ns = arrival_ns
-            device_ns = 0
 
-        # The line is not fitted while a step of the hub's clock is undecided, because the delay of
-        # a sample (arrival minus sampling) is unknown then.
+        problem = CLOCK_STANDS_STILL if self._is_still else ""
+        if len(self._steps_ns) == MAX_STEPS and 0 <= arrival_ns - self._steps_ns[0] < STEPS_NS:
+            problem = CLOCK_KEEPS_JUMPING
+        if problem:
+            self.problems.add(problem)
+            self._step_us = 0
         arrival = arrival_ns - track.first_ns
-        if self._decision is None and self.line.add(device_ns, arrival, self._is_late):
-            self.problems.add(CLOCK_SET)
-            self._count_reset()
-        if problem or self._decision is not None:
-            self.in_doubt = True
+        if self._step_us:
+            self._decide(self.line.height(1000 * (newest_us - track.first_us), arrival), arrival_ns)
+        # Without a device time, or while a step is undecided, delays are unknown.
+        if not self._is_still and not self._step_us:
+            device_ns = 1000 * (newest_us - track.first_us)
+            if self.line.add(device_ns, arrival, is_late):
+                self._count_step(CLOCK_SET)
+        self.in_doubt |= bool(problem or self._step_us)
         return not problem
 
-    def _find_problem(self, device_us: int, arrival_ns: int) -> str:
-        """Return the text of the problem for which device times cannot be converted; empty if none.
-
-        Args:
-            device_us: Device time of the newest sample, in µs.
-            arrival_ns: Host time at which it arrived, in ns.
-        """
-        is_same = device_us == self._last_us
-        self._n_still += is_same
-        is_long = self._n_still >= MIN_STILL_READS
-        stood_still = is_long and arrival_ns - self._moved_ns > MIN_STILL_NS
-        if is_same and stood_still:
-            return CLOCK_STANDS_STILL
-        if not is_same:
-            if stood_still:
-                # The clock runs again, but it is unknown for how long it stood still.
-                self.reset()
-            self._last_us = device_us
-            self._moved_ns = arrival_ns
-            self._n_still = 0
-        steps_ns = self._steps_ns
-        if steps_ns and arrival_ns - steps_ns[0] > STEPS_NS:
-            steps_ns.popleft()
-        return CLOCK_KEEPS_JUMPING if len(steps_ns) == MAX_STEPS else ""
-
-    def _begin_decision(self, step_us: int, arrival_ns: int) -> None:
-        """Begin to decide whether the hub's clock was set, or the hub sampled late or early.
-
-        If a decision about an earlier step is pending, the two steps are decided as one.
-
-        Args:
-            step_us: Device time of the sample minus the time expected from the sample period, in
-                µs.
-            arrival_ns: Host time at which the sample after the step arrived, in ns.
-        """
+    def _convert(self, times: Sequence[int], arrival_ns: int, is_late: bool) -> list[int]:
+        """Fit the line to samples that arrived together, and return their stamps."""
+        if not times:
+            return []
         track = self.track
-        if self._decision is None:
-            self._decision = StepDecision(
-                step_us,
-                newest_ns=track.newest_ns,
-                before_ns=track.last_arrival_ns - track.first_ns,
-                since_ns=arrival_ns - track.first_ns,
-                usual_delay_ns=self.line.recent_min_height,
-            )
-            return
-        step_us += self._decision.step_us
-        # If the two steps of the hub's clock cancel each other, there is nothing to decide.
-        self._decision = replace(self._decision, step_us=step_us) if step_us else None
-
-    def _decide(self, decision: StepDecision, newest_us: int, arrival_ns: int) -> None:
-        """Decide whether the hub's clock was set or the hub sampled late, if that is possible now.
-
-        Args:
-            decision: The pending decision.
-            newest_us: Device time of the newest sample, in µs.
-            arrival_ns: Host time at which it arrived, in ns.
-        """
-        device_ns = 1000 * (newest_us - self.track.first_us)
-        arrival = arrival_ns - self.track.first_ns
-        if not self._is_late:
-            delay = self.line.height(device_ns, arrival)
-            was_set = decision.was_set(device_ns, delay, arrival, self.track.jitter_ns)
-        else:
-            # The delays of samples that this host reads too late do not show whether the hub's
-            # clock was set. After the time limit the clock counts as not set; if it was set, the
-            # check of later delays finds the step.
-            is_in_time = arrival - decision.since_ns <= MAX_DECISION_NS
-            was_set = None if is_in_time else False
-        if was_set is None:
-            return
-        self._decision = None
-        if not was_set:
-            self.track.period_us = 0.0
-            return
-        # The origin of device times is moved by the step, so that times relative to it continue
-        # without a step and the clock line stays valid.
-        self.track.first_us += decision.step_us
-        self.track.newest_ns = min(self.track.newest_ns, decision.newest_ns)
-        self._doubtful_stamp = self.track.last_stamp_ns
-        self.line.discard_round_trips_after(decision.before_ns)
-        self.problems.add(CLOCK_SET)
-        self._count_reset()
+        # Of the samples that arrive together, only the newest can have the smallest delay.
+        is_usable = self._learn(max(times), arrival_ns, is_late)
+        stamps = []
+        for time_us in times:
+            device_ns = 1000 * (time_us - track.first_us)
+            offset = round(track.bounded_offset + track.drift * device_ns)
+            stamp = track.first_ns + device_ns + offset
+            if not is_usable or not 0 <= arrival_ns - stamp <= MAX_DELAY_NS:
+                stamp = arrival_ns
+            if device_ns <= track.newest_ns and is_usable:
+                # A sample that came out of order must not get a later stamp than the newest one.
+                stamp = min(stamp, track.last_stamp_ns)
+            else:
+                self.in_doubt |= stamp < min(self._doubtful_stamp, track.last_stamp_ns)
+                track.newest_ns = max(device_ns, track.newest_ns)
+                track.last_stamp_ns = stamp = max(stamp, track.last_stamp_ns)
+            stamps.append(stamp)
+        return stamps
