@@ -28,12 +28,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ..bags.source import open_bag
-from ..core.arrays import Array, Index
+from ..core.arrays import Array
 from ..core.calibration import Calibration
 from ..core.compensation.low_pass import relaxed_share
 from ..core.compensation.models import CreepModel
 from ..core.errors import FitError
 from ..messages.codec import SECOND
+from .block_means import find_lags
 from .fit import measured_stress
 from .recorded_loads import average_neighbours, find_cube, read_samples
 
@@ -143,27 +144,14 @@ class _Hold(NamedTuple):
         is_loaded: 1 under the load, 0 after it (N,).
         n_readings: Number of readings in each block (N,).
         reading: Readings of the pads (N, P), in Pa.
+        memory: Low-passed readings (N, K, P), in Pa, for K relaxation times.
     """
 
     time: Array
     is_loaded: Array
     n_readings: Array
     reading: Array
-
-
-class _CreepSolution(NamedTuple):
-    """Amplitudes of the creep law for K relaxation times, by least squares.
-
-    Attributes:
-        amplitude: Amplitudes of each pad (P, K).
-        error: Measured minus computed averages of the readings (N, P), in Pa.
-        deviation: Change of the amplitudes (P, K) that stands for their uncertainty. It changes the
-            creep predicted under a long load by the standard deviation of this prediction.
-    """
-
-    amplitude: Array
-    error: Array
-    deviation: Array
+    memory: Array
 
 
 def fit_recorded_creep(path: Path, name: str | None) -> tuple[CreepFit, Calibration]:
@@ -229,18 +217,12 @@ def fit_creep(
 
     press, release = _find_hold(seconds, reading)
     hold_s = release - press
-    blocks = _find_blocks(seconds, press, release)
-    block_time = [seconds[block].mean() for block in blocks]
-    is_loaded = [seconds[block[0]] < release for block in blocks]
-    n_readings = [len(block) * size for block in blocks]
-    means = _Hold(
-        time=np.array(block_time) - press,
-        is_loaded=np.array(is_loaded, float),
-        n_readings=np.array(n_readings),
-        reading=_average_blocks(reading, blocks),
-    )
-    held = means.reading[means.is_loaded > 0]
-    load = held.mean(axis=0)
+    decades = np.log10(REACH * hold_s / SHORTEST_TIME_S)
+    n_times = 1 + int(np.ceil(TIMES_PER_DECADE * decades))
+    time = SHORTEST_TIME_S * 10 ** (np.arange(n_times) / TIMES_PER_DECADE)
+    means = _average(seconds, reading, time, press, release)
+    means = means._replace(n_readings=size * means.n_readings)
+    load = means.reading[means.is_loaded > 0].mean(axis=0)
     needed = MIN_LOAD_RATIO * noise
     is_weak = np.abs(load) < needed
     for pad in np.flatnonzero(is_weak).tolist():
@@ -249,24 +231,16 @@ def fit_creep(
             "press harder, so that every pad is loaded"
         )
 
-    decades = np.log10(REACH * hold_s / SHORTEST_TIME_S)
-    n_times = 1 + int(np.ceil(TIMES_PER_DECADE * decades))
-    time = SHORTEST_TIME_S * 10 ** (np.arange(n_times) / TIMES_PER_DECADE)
-    memory = _find_memories(seconds, reading, time, blocks)
     forecast = relaxed_share(FORECAST * hold_s / time)
-    first = _solve(means, memory, load, noise, forecast, 1.0, FIRST_BEND)
+    first, _, _ = _solve(means, load, noise, forecast, 1.0, FIRST_BEND)
     # The recording determines well only the amplitudes whose relaxation time lies between the time
     # of the first fitted reading and a third of the load's duration.
     is_known = (time > SETTLE_S) & (time < hold_s / 3)
-    known = first.amplitude[:, is_known]
-    shorter = known[:, :-1]
-    longer = known[:, 1:]
-    products = longer * shorter
-    growth = float(products.sum() / (shorter**2).sum())
-    solution = _solve(means, memory, load, noise, forecast, growth, BEND)
-    amplitude = solution.amplitude
-    relative_error = solution.error / load
-    misfit = float(np.sqrt(np.mean(relative_error**2)))
+    known = first[:, is_known]
+    shorter, longer = known[:, :-1], known[:, 1:]
+    growth = float((longer * shorter).sum() / (shorter**2).sum())
+    amplitude, error, change = _solve(means, load, noise, forecast, growth, BEND)
+    misfit = float(np.sqrt(np.mean((error / load) ** 2)))
     total = amplitude.sum(axis=1).max()
     if misfit > MAX_MISFIT or total >= 1:
         raise FitError(
@@ -280,7 +254,7 @@ def fit_creep(
     fast = np.zeros_like(amplitude)
     fast_error = FAST_ERROR * amplitude[:, 0]
     fast[:, 0] = np.hypot(misfit, fast_error)
-    deviation = np.array([fast, solution.deviation])
+    deviation = np.array([fast, change])
     first_reading = np.outer(means.is_loaded, means.reading[0])
     return CreepFit(
         model=CreepModel(time, amplitude, deviation),
@@ -289,7 +263,7 @@ def fit_creep(
         misfit=misfit,
         seconds=means.time,
         before=means.reading - first_reading,
-        after=solution.error,
+        after=error,
     )
 
 
@@ -300,21 +274,15 @@ def compute_step_reading(model: CreepModel, seconds: float) -> Array:
         model: The law of creep.
         seconds: Time after the rise, in s.
     """
-    times = np.geomspace(1e-4, seconds, 300)
-    amplitude = model.amplitude.T
-    memory = np.zeros_like(amplitude)
-    reading = np.ones(len(model.amplitude))
-    for step in np.diff(times, prepend=0.0):
-        ratio = step / model.time[:, None]
-        share = relaxed_share(ratio)
-        slope_share = 1 - share / ratio
-        # The stress is 1, so the new reading u_1 is 1 + sum_k a_k r_k. The low-passed readings r_k
-        # contain `slope_share` * u_1, so the equation is solved for u_1.
-        memory += share * (reading - memory) - slope_share * reading
-        known = 1 + (amplitude * memory).sum(axis=0)
-        weight = 1 - (amplitude * slope_share).sum(axis=0)
-        reading = known / weight
-        memory += slope_share * reading
+    # With the reading u = 1 + a r, the memories r obey the linear equation tau dr/dt = 1 + a r - r,
+    # whose solution follows from its eigenvalues.
+    n_times = len(model.time)
+    system = (model.amplitude[:, None] - np.eye(n_times)) / model.time[:, None]
+    values, vectors = np.linalg.eig(system)
+    drive = np.linalg.solve(vectors, 1 / np.tile(model.time[:, None], (len(values), 1, 1)))
+    grown = np.expm1(values * seconds) / values
+    memory = vectors @ (grown[..., None] * drive)
+    reading: Array = 1 + (model.amplitude[:, None] @ memory)[:, 0, 0].real
     return reading
 
 
@@ -364,93 +332,75 @@ def _find_hold(seconds: Array, reading: Array) -> tuple[float, float]:
     return press, release
 
 
-def _find_blocks(
+def _average(
     seconds: Array,
+    reading: Array,
+    time: Array,
     press: float,
     release: float,
-) -> list[Index]:
-    """Divide readings into blocks, whose length grows with the time since the load changed.
+) -> _Hold:
+    """Average readings over blocks, whose length grows with the time since the load changed.
 
     Readings within `SETTLE_S` of a change of the load are in no block.
 
     Args:
         seconds: Times of the readings (S,), in s.
+        reading: Readings of the pads (S, P), in Pa, of which the first is without load.
+        time: Relaxation times of the law (K,), in s.
         press: Time at which the load began, in s.
         release: Time at which it ended, in s.
-
-    Returns:
-        Numbers of the readings in each block.
     """
-    blocks: list[Index] = []
-    for begin, end in ((press, release), (release, np.inf)):
-        is_settled = seconds > begin + SETTLE_S
-        is_settled &= seconds < end - SETTLE_S
-        chosen = np.flatnonzero(is_settled)
-        elapsed = seconds[chosen] - begin
-        place = np.floor(BLOCKS_PER_E_FOLD * np.log(elapsed))
-        bounds = np.flatnonzero(np.diff(place)) + 1
-        parts = np.split(chosen, bounds)
-        blocks += [part for part in parts if len(part)]
-    return blocks
+    is_after = seconds > release
+    elapsed = seconds - np.where(is_after, release, press)
+    is_ending = ~is_after & (seconds >= release - SETTLE_S)
+    chosen = np.flatnonzero((elapsed > SETTLE_S) & ~is_ending)
+    place = np.floor(BLOCKS_PER_E_FOLD * np.log(elapsed[chosen]))
+    starts = np.flatnonzero(np.diff(place, prepend=-1))
+    n_readings = np.diff(starts, append=len(chosen))
 
+    def average(values: Array) -> Array:
+        """Return the means of values (S, ...) over the blocks (N, ...)."""
+        sums = np.add.reduceat(values[chosen], starts, axis=0)
+        means: Array = (sums.T / n_readings).T
+        return means
 
-def _find_memories(
-    seconds: Array,
-    reading: Array,
-    time: Array,
-    blocks: list[Index],
-) -> Array:
-    """Return the readings after low-pass filters, averaged over blocks (N, K, P).
-
-    Args:
-        seconds: Times of the readings (S,), in s.
-        reading: Readings of the pads (S, P), in Pa, of which the first is without load.
-        time: Time constants of the filters, the relaxation times of the law (K,), in s.
-        blocks: Numbers of the readings in each of N blocks.
-    """
-    steps = np.diff(seconds)
-    ratio = steps[:, None, None] / time[:, None]
-    share = relaxed_share(ratio)
-    slope_share = 1 - share / ratio
-    change = np.diff(reading, axis=0)
-    shape = len(seconds), len(time), reading.shape[1]
-    memory = np.zeros(shape)
-    for n, before in enumerate(memory[:-1]):
-        relaxed = before + share[n] * (reading[n] - before)
-        memory[n + 1] = relaxed + slope_share[n] * change[n]
-    return _average_blocks(memory, blocks)
-
-
-def _average_blocks(values: Array, blocks: list[Index]) -> Array:
-    """Return the mean of values (S, ...) over each of N blocks of indices, as (N, ...)."""
-    means = [values[block].mean(axis=0) for block in blocks]
-    return np.array(means)
+    memory = reading[:, None] - find_lags(seconds, reading, time)
+    return _Hold(
+        time=average(seconds) - press,
+        is_loaded=np.where(is_after[chosen[starts]], 0.0, 1.0),
+        n_readings=n_readings,
+        reading=average(reading),
+        memory=average(memory),
+    )
 
 
 def _solve(
     means: _Hold,
-    memory: Array,
     load: Array,
     noise: Array,
     forecast: Array,
     growth: float,
     bend: float,
-) -> _CreepSolution:
+) -> tuple[Array, Array, Array]:
     """Fit the amplitudes of the creep law to averaged readings by regularised least squares.
 
     The regularisation makes the amplitudes a_k of successive relaxation times a smooth sequence.
 
     Args:
         means: Averages of the readings over N blocks of time.
-        memory: Averages of the low-passed readings (N, K, P), in Pa, for K relaxation times.
         load: Mean reading of each pad under the load (P,), in Pa.
         noise: Standard deviation of a reading of each pad (P,), in Pa.
         forecast: Low-passed readings (K,) at the end of a long load with a constant reading of 1.
         growth: Expected ratio q of an amplitude to that of the next shorter relaxation time.
         bend: Expected standard deviation of the differences a_k+1 - 2 q a_k + q² a_k-1, divided by
             the mean amplitude.
+
+    Returns:
+        Amplitudes of each pad (P, K); measured minus computed averages of the readings (N, P), in
+        Pa; and a change of the amplitudes (P, K) that stands for their uncertainty. It changes the
+        creep predicted under a long load by the standard deviation of this prediction.
     """
-    n_times = memory.shape[1]
+    n_times = means.memory.shape[1]
     held = means.reading[means.is_loaded > 0]
     # About half of the relaxation times are shorter than the duration of the load, and only their
     # amplitudes contribute to the creep under it. The mean amplitude follows from that.
@@ -459,36 +409,28 @@ def _solve(
     identity = np.eye(n_times)
     steps = identity[1:] - growth * identity[:-1]
     bends = steps[1:] - growth * steps[:-1]
-    rows = np.concatenate([steps[:1], bends])
+    rows = np.concatenate([steps[:1], bends]) / (bend * mean_amplitude + 1e-9)
     # The first column stands for the stress under the load, which the regularisation leaves free.
-    smooth = np.zeros((len(rows), 1 + n_times))
-    smooth[:, 1:] = rows / (bend * mean_amplitude + 1e-9)
+    smooth = np.pad(rows, [(0, 0), (1, 0)])
 
-    shape = len(load), n_times
-    found = _CreepSolution(
-        amplitude=np.empty(shape),
-        error=np.empty_like(means.reading),
-        deviation=np.empty(shape),
-    )
+    error = np.empty_like(means.reading)
+    amplitude, change = np.empty((2, len(load), n_times))
     for pad, pad_load in enumerate(load):
         reading = means.reading[:, pad]
         mean_noise = noise[pad] / np.sqrt(means.n_readings)
         deviation = np.hypot(mean_noise, READING_ERROR * pad_load)
         # The unknowns are the constant stress under the load, then the amplitudes.
-        columns = np.column_stack([means.is_loaded, memory[..., pad]])
-        weighted = columns / deviation[:, None]
-        system = np.concatenate([weighted, smooth])
-        right = np.zeros(len(system))
-        right[: len(reading)] = reading / deviation
+        columns = np.column_stack([means.is_loaded, means.memory[..., pad]])
+        system = np.concatenate([columns / deviation[:, None], smooth])
+        right = np.pad(reading / deviation, (0, len(smooth)))
         solution, *_ = np.linalg.lstsq(system, right, rcond=None)
-        found.amplitude[pad] = solution[1:]
-        found.error[:, pad] = reading - columns @ solution
+        amplitude[pad] = solution[1:]
+        error[:, pad] = reading - columns @ solution
         # The creep at the end of a long load is predicted. Its gradient g with respect to the
         # amplitudes is `forecast`, and C is the covariance of the amplitudes. A change of them by
         # C g / sqrt(g' C g) changes the prediction by one standard deviation. The stress under the
         # load counts as known, because the calibration of gains determines it.
-        amplitudes = system[:, 1:]
-        normal = amplitudes.T @ amplitudes
-        spread = np.linalg.solve(normal, forecast)
-        found.deviation[pad] = spread / np.sqrt(forecast @ spread)
-    return found
+        of_amplitudes = system[:, 1:]
+        spread = np.linalg.solve(of_amplitudes.T @ of_amplitudes, forecast)
+        change[pad] = spread / np.sqrt(forecast @ spread)
+    return amplitude, error, change

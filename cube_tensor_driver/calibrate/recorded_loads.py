@@ -15,12 +15,12 @@ import numpy as np
 from ..bags.read import Bag
 from ..bags.read import stamp_ns as header_stamp_ns
 from ..bags.source import BagSource, open_bag
-from ..core.arrays import AnyArray, Array, Index, Times
+from ..core.arrays import AnyArray, Array, Times
 from ..core.calibration import Calibration
 from ..core.errors import BagError
 from ..core.layout import Layout
 from ..core.modes import COMPONENTS, STRESS
-from ..core.rows import FrequencyRows, concatenate
+from ..core.rows import concatenate
 from ..core.symmetry import default_modes
 from ..messages.codec import SECOND
 from ..messages.types import STRESS as BATCH_TYPE
@@ -167,52 +167,6 @@ def find_cubes(
         listed = ", ".join(names[:MAX_LISTED_CUBES])
         raise BagError(f"{path}: no cube {name!r}; there are {listed}")
     return [names.index(name)]
-
-
-class BlockMeans:
-    """Means of values of the rows (samples of one cube) of a bag over blocks of time.
-
-    Attributes:
-        counts: Number of rows in each block (cubes, blocks).
-    """
-
-    def __init__(
-        self,
-        source: BagSource,
-        block_ns: int,
-        n_values: int,
-    ) -> None:
-        """Divide the time of a bag into blocks.
-
-        Args:
-            source: The opened bag.
-            block_ns: Duration of a block, in ns.
-            n_values: Number of values of a row that are averaged.
-        """
-        bag = source.bag
-        self._start_ns = bag.start_ns
-        self._block_ns = block_ns
-        n_blocks = (bag.end_ns - bag.start_ns) // block_ns + 1
-        shape = len(source.skin.cubes), n_blocks
-        self.counts = np.zeros(shape)
-        self._sums = np.zeros((*shape, n_values))
-
-    def add(self, rows: FrequencyRows, values: AnyArray) -> None:
-        """Add values (N, n_values) of N rows; a row with a value that is not finite is ignored."""
-        n_blocks = self.counts.shape[1]
-        block = (rows.stamp_ns - self._start_ns) // self._block_ns
-        is_within = (block >= 0) & (block < n_blocks)
-        is_used = is_within & np.isfinite(values).all(axis=1)
-        place = rows.cube[is_used], block[is_used]
-        np.add.at(self._sums, place, values[is_used])
-        np.add.at(self.counts, place, 1)
-
-    def of_cube(self, cube: int) -> tuple[Index, Array]:
-        """Return the numbers (n,) of the blocks with rows of a cube, and means (n, n_values)."""
-        number = np.flatnonzero(self.counts[cube])
-        counts = self.counts[cube, number]
-        sums = self._sums[cube, number]
-        return number, sums / counts[:, None]
 
 
 def read_samples(

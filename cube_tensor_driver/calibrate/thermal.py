@@ -28,18 +28,17 @@ import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from ..bags.source import open_bag
 from ..core.arrays import Array
 from ..core.calibration import Calibration
 from ..core.compensation.models import ThermalModel
 from ..core.compensation.thermal import START_KELVIN, filter_weights
 from ..core.errors import BagError, FitError
 from ..core.oscillator import pad_frequency
-from ..core.pipeline import Pipeline
-from .recorded_loads import BlockMeans, find_cubes
+from .block_means import BlockMeans, find_lags
 
 BLOCK_NS = 1_000_000_000
 """Duration, in ns, of the blocks whose mean temperatures and pad stresses are fitted."""
@@ -167,25 +166,26 @@ class ThermalFit:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class _Solution:
+class _Solution(NamedTuple):
     """Solution by weighted least squares for given time constants and degree of the polynomial.
 
     Attributes:
-        lags: Time constants of the low-pass filters, in s.
-        degree: Highest power of the filtered temperature u.
+        lags: Time constants of the low-pass filters, in s, the longest first.
+        behind: How far the filtered temperature u lags behind the measured one (N,), in K.
         columns: Design matrix (N, K): 1, u, ..., u^degree, then the decay of the unknown difference
             between elastomer and thermometer at the start.
         weight: Square roots of the weights (N,), in 1/Pa.
         values: Coefficients (K, P).
+        residual: Measured minus fitted stresses (N, P), in Pa.
         misfit: Negative logarithm of the likelihood per stress, without constants.
     """
 
     lags: tuple[float, ...]
-    degree: int
+    behind: Array
     columns: Array
     weight: Array
     values: Array
+    residual: Array
     misfit: float
 
 
@@ -206,81 +206,34 @@ def read_warming(
     Raises:
         BagError: A bag has no such cube or states no temperature, or the bags have different cubes.
     """
-    parts: list[BlockMeans] = []
-    names: list[str] = []
-    for path in paths:
-        with open_bag(path) as source:
-            if names and names != list(source.skin.names):
-                raise BagError(f"{path}: its cubes are not those of {paths[0]}; fit it alone")
-            names = list(source.skin.names)
-            cubes = find_cubes(source, path, name)
-            settings = source.recording.settings[-1]
-            calibrations = [
-                replace(
-                    one,
-                    temperature=None,
-                    thermal=None,
-                    rest_frequency=rest[: one.layout.n_pads],
-                )
-                for one, rest in zip(settings.calibrations, settings.rest_frequency, strict=True)
-            ]
-            pipeline = Pipeline(calibrations)
-            blocks = BlockMeans(source, BLOCK_NS, pipeline.n_pads + 1)
-            for rows in source:
-                # The stresses of all pads are computed, even of those that the device reports as
-                # broken, because every block must have the same pads.
-                left_out = np.zeros_like(rows.pad_fault)
-                stress = pipeline.pad_stress(rows, left_out)
-                values = np.nan_to_num(stress), rows.temperature[:, None]
-                blocks.add(rows, np.hstack(values))
-            if not blocks.counts.any():
-                raise BagError(
-                    f"{path}: its rows state no temperature; record with hubs that measure it"
-                )
-            parts.append(blocks)
+    bags = [BlockMeans(path, name, BLOCK_NS, "temperature", width=1) for path in paths]
+    first = bags[0]
+    for path, bag in zip(paths, bags, strict=True):
+        if bag.names != first.names:
+            raise BagError(f"{path}: its cubes are not those of {paths[0]}; fit it alone")
+        if not bag.counts.any():
+            raise BagError(
+                f"{path}: its rows state no temperature; record with hubs that measure it"
+            )
     found = {}
-    for cube in cubes:
-        label = f"{paths[0]}: cube {names[cube]}"
-        warming = _join(parts, cube, calibrations[cube], label)
-        found[names[cube]] = calibrations[cube], warming
+    for cube in first.cubes:
+        base = bags[-1].calibrations[cube]
+        rest = bags[-1].rest_frequency[cube, : base.layout.n_pads]
+        base = replace(base, temperature=None, thermal=None, rest_frequency=rest)
+        parts = [bag.of_cube(cube) for bag in bags]
+        seconds, stress, temperature = (np.concatenate(each) for each in zip(*parts, strict=True))
+        ends = np.cumsum([len(part[0]) for part in parts])
+        rows_per_block = sum(bag.counts[cube].sum() for bag in bags) / max(len(seconds), 1)
+        warming = Warming(
+            name=f"{paths[0]}: cube {first.names[cube]}",
+            seconds=seconds,
+            first=(0, *ends[:-1].tolist()),
+            temperature=temperature[:, 0],
+            stress=stress,
+            noise=base.noise.mean() / np.sqrt(max(rows_per_block, 1)),
+        )
+        found[first.names[cube]] = base, warming
     return found
-
-
-def _join(
-    parts: Sequence[BlockMeans],
-    cube: int,
-    calibration: Calibration,
-    name: str,
-) -> Warming:
-    """Return the means of one cube in all bags.
-
-    Args:
-        parts: Means of the pads' stresses and of the temperature in each bag.
-        cube: Number of the cube.
-        calibration: Calibration of the cube.
-        name: Bag and cube, for messages.
-    """
-    tables: list[Array] = []
-    first = [0]
-    n_rows = 0.0
-    for part in parts:
-        number, means = part.of_cube(cube)
-        seconds = number * (BLOCK_NS * 1e-9)
-        tables.append(np.column_stack([seconds, means]))
-        first.append(first[-1] + len(number))
-        n_rows += part.counts[cube].sum()
-
-    table = np.concatenate(tables)
-    n_pads = calibration.layout.n_pads
-    rows_per_block = n_rows / max(len(table), 1)
-    return Warming(
-        name=name,
-        seconds=table[:, 0],
-        first=tuple(first[:-1]),
-        temperature=table[:, -1],
-        stress=table[:, 1 : 1 + n_pads],
-        noise=calibration.noise.mean() / np.sqrt(max(rows_per_block, 1)),
-    )
 
 
 def fit_thermal(data: Warming) -> ThermalFit:
@@ -342,22 +295,19 @@ def _search(
         slope: Rms of the linear coefficients over the pads, in Pa/K; 0: not known yet.
     """
 
-    def solve(choices: Iterable[tuple[float, ...]]) -> _Solution:
-        solutions = (_solve(data, lags, degree, slope) for lags in choices)
+    def find_best(choices: Iterable[tuple[float, ...]]) -> _Solution:
+        behind = _find_lags(data, list(choices))
+        solutions = (_solve(data, *choice, degree, slope) for choice in behind.items())
         return min(solutions, key=lambda solution: solution.misfit)
 
-    longest_first = LAGS_S[::-1].tolist()
-    best = solve(itertools.combinations(longest_first, n_lags))
+    best = find_best(itertools.combinations(LAGS_S[::-1].tolist(), n_lags))
     step = LAGS_S[1] / LAGS_S[0]
     while step > MAX_LAG_STEP:
-        near = []
-        for factors in itertools.product((1 / step, 1.0, step), repeat=n_lags):
-            scaled = zip(factors, best.lags, strict=True)
-            lags = tuple(factor * lag for factor, lag in scaled)
-            # Filters with nearly the same lag would have huge weights of opposite signs.
-            if all(a > 1.2 * b for a, b in itertools.pairwise(lags)):
-                near.append(lags)
-        found = solve(near)
+        near = itertools.product(*((lag / step, lag, lag * step) for lag in best.lags))
+        # Filters with nearly the same lag would have huge weights of opposite signs.
+        found = find_best(
+            lags for lags in near if all(a > 1.2 * b for a, b in itertools.pairwise(lags))
+        )
         if found.misfit < best.misfit - 1e-4:
             best = found
         else:
@@ -365,37 +315,33 @@ def _search(
     return best
 
 
-def _filter(data: Warming, lags: tuple[float, ...]) -> Array:
-    """Return the temperatures (N,) of the N blocks of time after low-pass filters in series.
+def _find_lags(
+    data: Warming,
+    choices: Sequence[tuple[float, ...]],
+) -> dict[tuple[float, ...], Array]:
+    """Return how far the temperature after low-pass filters in series lags behind (N,), in K.
 
     At the begin of each bag, the output of the filters equals the measured temperature.
 
     Args:
-        data: Averages over blocks of time.
-        lags: Time constants of the filters, in s.
+        data: Averages over N blocks of time.
+        choices: Choices of time constants of the filters, in s, which are the keys of the result.
     """
-    total = np.zeros(len(data.seconds))
-    bounds = [*data.first, len(data.seconds)]
-    weights = filter_weights(np.array(lags))
-    for lag, weight in zip(lags, weights, strict=True):
-        for begin, end in itertools.pairwise(bounds):
-            measured = data.temperature[begin:end]
-            steps = np.diff(data.seconds[begin:end]) / lag
-            decay = np.exp(-steps)
-            mean_decay = -np.expm1(-steps) / steps
-            rise = np.diff(measured) * mean_decay
-            x = measured[0]
-            filtered = [x]
-            for n, (before, now) in enumerate(itertools.pairwise(measured.tolist())):
-                x = now + (x - before) * decay[n] - rise[n]
-                filtered.append(x)
-            total[begin:end] += weight * np.array(filtered)
-    return total
+    times = sorted({lag for lags in choices for lag in lags})
+    readings = np.column_stack([data.seconds, data.temperature])
+    bags = np.split(readings, data.first[1:])
+    parts = [find_lags(bag[:, 0], bag[:, 1:], np.array(times)) for bag in bags]
+    single = dict(zip(times, np.concatenate(parts)[..., 0].T, strict=True))
+    return {
+        lags: filter_weights(np.array(lags)) @ np.array([single[lag] for lag in lags])
+        for lags in choices
+    }
 
 
 def _solve(
     data: Warming,
     lags: tuple[float, ...],
+    behind: Array,
     degree: int,
     slope: float,
 ) -> _Solution:
@@ -405,40 +351,26 @@ def _solve(
         data: Averages over blocks of time.
         lags: Time constants, in s, of the low-pass filters that compute the temperature of the
             elastomer, the longest first.
+        behind: How far it lags behind the measured temperature (N,), in K.
         degree: Degree of the polynomial.
         slope: Rms of the linear coefficients over the pads, in Pa/K, for the weights of the blocks;
             0: not known yet.
     """
-    filtered = _filter(data, lags)
-    u = filtered - data.temperature[0]
+    u = data.temperature - data.temperature[0] - behind
     start = np.exp(-data.seconds / lags[0])
-    powers = [u**d for d in range(degree + 1)]
-    columns = np.column_stack([*powers, start])
-
-    lag_error = LAG_ERROR * slope * (data.temperature - filtered)
-    variance = data.noise**2 + lag_error**2
-    weight = 1 / np.sqrt(variance)
+    columns = np.column_stack([*(u**d for d in range(degree + 1)), start])
+    weight = 1 / np.hypot(data.noise, LAG_ERROR * slope * behind)
     weighted = columns * weight[:, None]
-    stress = data.stress * weight[:, None]
-
     normal = weighted.T @ weighted
     # The prior of the last unknown: at the start, the temperature of the elastomer differs from the
     # measured one by about 1 K.
     start_deviation = START_KELVIN * max(slope, 1.0)
     normal[-1, -1] += 1 / start_deviation**2
-    values = np.linalg.solve(normal, weighted.T @ stress)
-
-    residual = (data.stress - columns @ values) * weight[:, None]
-    mean_square = (residual**2).mean()
-    misfit = 0.5 * np.log(mean_square) - np.log(weight).mean()
-    return _Solution(
-        lags,
-        degree,
-        columns,
-        weight,
-        values,
-        float(misfit),
-    )
+    values = np.linalg.solve(normal, weighted.T @ (data.stress * weight[:, None]))
+    residual = data.stress - columns @ values
+    size = root_mean_square(residual * weight[:, None])
+    misfit = np.log(size) - np.log(weight).mean()
+    return _Solution(lags, behind, columns, weight, values, residual, float(misfit))
 
 
 def _describe(data: Warming, best: _Solution) -> ThermalFit:
@@ -448,12 +380,8 @@ def _describe(data: Warming, best: _Solution) -> ThermalFit:
         data: Averages over blocks of time.
         best: The solution.
     """
-    degrees = slice(1, 1 + best.degree)
-    residual = data.stress - best.columns @ best.values
-    level = best.columns[:, 1]
-    behind = data.temperature - data.temperature[0] - level
-    sum_of_squares = float((behind**2).sum())
-    covariance = residual.T @ residual / max(sum_of_squares, 1e-12)
+    lags, behind, columns, weight, values, residual, _ = best
+    covariance = residual.T @ residual / max(float(behind @ behind), 1e-12)
     variances, directions = np.linalg.eigh(covariance)
     patterns = directions * np.sqrt(np.maximum(variances, 0))
     # `eigh` returns eigenvalues in rising order, so the largest errors come last.
@@ -461,40 +389,26 @@ def _describe(data: Warming, best: _Solution) -> ThermalFit:
 
     # The lags are uncertain, too. Each counts as one more unknown, whose column is the derivative
     # of the filtered temperature with respect to the logarithm of the lag.
-    moved = []
-    for number, lag in enumerate(best.lags):
-        changed = list(best.lags)
-        changed[number] = 1.05 * lag
-        shift = _filter(data, tuple(changed)) - data.temperature[0] - level
-        moved.append(shift / 0.05)
-    columns = np.column_stack([best.columns, *moved])
-    weighted = columns * best.weight[:, None]
+    moved = [(*lags[:n], 1.05 * lag, *lags[n + 1 :]) for n, lag in enumerate(lags)]
+    shifts = [(behind - other) / 0.05 for other in _find_lags(data, moved).values()]
+    weighted = np.column_stack([columns, *shifts]) * weight[:, None]
     inverse = np.linalg.pinv(weighted.T @ weighted)
-
-    block = (data.seconds // best.lags[0]).astype(int)
+    block = (data.seconds // lags[0]).astype(int)
     starts = np.flatnonzero(np.diff(block, prepend=-1))
-    weighted_residual = residual * best.weight[:, None]
-    scores = weighted[:, :, None] * weighted_residual[:, None]
-    summed = np.add.reduceat(scores, starts, axis=0)
-    spread = np.einsum("kl,blp->bkp", inverse, summed)
+    scores = weighted[:, :, None] * (residual * weight[:, None])[:, None]
+    spread = inverse @ np.add.reduceat(scores, starts, axis=0)
     size = np.sqrt((spread**2).sum(axis=0))
 
-    reference = round(float(data.temperature[0]), 3)
+    degrees = slice(1, columns.shape[1] - 1)
     sign = np.where(ramp[:, :1] < 0, -1.0, 1.0)
     model = ThermalModel(
-        reference=np.array(reference),
-        lag=np.array(best.lags),
-        coefficient=best.values[degrees].T,
+        reference=np.array(round(float(data.temperature[0]), 3)),
+        lag=np.array(lags),
+        coefficient=values[degrees].T,
         deviation=size[degrees].T * sign,
         ramp=ramp,
     )
-    return ThermalFit(
-        data,
-        model,
-        best.values[0],
-        level,
-        residual,
-    )
+    return ThermalFit(data, model, values[0], columns[:, 1], residual)
 
 
 def _check(
