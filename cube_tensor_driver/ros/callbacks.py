@@ -16,6 +16,8 @@ from typing import Any
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 
+from ..core.errors import CubeError
+
 Callback = Callable[..., Any]
 """Function that rclpy calls for a message, timer or service request, with arguments that depend on
 which of these it is."""
@@ -71,10 +73,14 @@ class CallbackErrors:
         """Wrap the callback of a service so that its exceptions are logged, counted and reported.
 
         The client still gets a response after an exception: `explain_failure` writes the text of
-        the exception into it, and the fields that the callback has not set keep their defaults.
+        the exception into it, and the fields that the callback has not set keep their defaults. A
+        CubeError means that the request is refused; it is not counted.
         """
 
         def explain(error: Exception, request: Any, response: Any) -> Any:
+            if isinstance(error, CubeError):
+                self._node.get_logger().warning(f"refused: {shorten(str(error))}")
+                return explain_failure(request, response, shorten(str(error)))
             self._note(error)
             return explain_failure(request, response, repr(error))
 

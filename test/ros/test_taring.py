@@ -22,6 +22,7 @@ from cube_tensor_driver.config.tare import read_tare, write_tare
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.msg import CubeInfo, SkinInfo
+from cube_tensor_driver.ros.callbacks import CallbackErrors
 from cube_tensor_driver.ros.nodes import taring
 from cube_tensor_driver.ros.nodes.taring import Taring
 from cube_tensor_driver.srv import Tare
@@ -38,10 +39,11 @@ class Node:
 
     def __init__(self) -> None:
         self.services = {}
+        self.errors = CallbackErrors(self)
         self.now_ns = 0
 
     def create_service(self, _, name, callback):
-        self.services[name] = callback
+        self.services[name] = self.errors.catch_in_service(callback)
 
     def own(self, entity):
         return entity
@@ -66,6 +68,7 @@ def skin(tmp_path):
         reconstructor.process(FrequencyRows.of([0], frequency, stamp_ns=node.now_ns))
     return SimpleNamespace(
         services=node.services,
+        errors=node.errors,
         rest=lambda: reconstructor.rest_frequency[0],
         learn_uid=lambda uid=UID: tares.on_info(
             SkinInfo(name=SKIN.name, cubes=[CubeInfo(uid=uid)])
@@ -101,7 +104,7 @@ def test_a_tare_writes_one_file_per_cube_and_its_answer_is_short(skin, monkeypat
     request = Tare.Request(cubes=["x" * 1_000_000, *map(str, range(5000))])
     answer = skin.services["~/tare"](request, Tare.Response())
     assert not answer.success and answer.message.startswith("no cube 'xxx")
-    assert len(answer.message) < 2000
+    assert len(answer.message) < 2000 and not skin.errors.count
 
 
 def test_a_tare_that_was_cleared_before_the_uid_was_known_does_not_come_back(skin):

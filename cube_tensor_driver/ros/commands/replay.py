@@ -433,11 +433,21 @@ def replay(
             clock=clock,
         )
         ReplayControl(node, player)
-        node.create_timer(MAX_STEP_S, lambda: on_step(player))
         on_stop_signal(player.end)
-        spin_until(executor, player.has_subscribers, step_s=LOOK_PERIOD_S)
+        # `on_step` may raise errors. A timer would not do, because rclpy prints a traceback of each
+        # error in a callback.
+        spin_until(
+            executor,
+            player.has_subscribers,
+            step_s=LOOK_PERIOD_S,
+            on_step=lambda: on_step(player),
+        )
         if not player.has_begun:
             player.begin()
+        next_step_s = time.monotonic()
         while not player.has_ended:
             executor.spin_once(timeout_sec=player.advance())
+            if time.monotonic() >= next_step_s:
+                on_step(player)
+                next_step_s = time.monotonic() + MAX_STEP_S
         on_step(player)

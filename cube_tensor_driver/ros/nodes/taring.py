@@ -20,11 +20,10 @@ from std_srvs.srv import Trigger
 from ...config.skin import Skin
 from ...config.tare import read_tare, remove_tare, write_tare
 from ...core.arrays import Array
-from ...core.errors import ConfigError, CubeError, TareError
+from ...core.errors import ConfigError, TareError
 from ...core.reconstructor import Reconstructor
 from ...msg import SkinInfo
 from ...srv import Tare
-from ..callbacks import shorten
 from ..node import CubeNode
 
 MAX_DATA_AGE_S = 1.0
@@ -227,12 +226,8 @@ class Taring:
         request: Tare.Request,
         response: Tare.Response,
     ) -> Tare.Response:
-        try:
-            response.message = self._tare(request.cubes, request.duration)
-            response.success = True
-        except CubeError as error:
-            response.success = False
-            response.message = shorten(str(error))
+        response.message = self._tare(request.cubes, request.duration)
+        response.success = True
         self._node.get_logger().info(f"tare: {response.message}")
         return response
 
@@ -271,19 +266,15 @@ class Taring:
         request: Trigger.Request,
         response: Trigger.Response,
     ) -> Trigger.Response:
-        response.success = True
-        response.message = "rest frequencies are the calibrations' again"
         with self._lock:
             self._reconstructor.clear_tare()
             self._on_change()
             rest = self._reconstructor.rest_frequency
         self.created = dict.fromkeys(range(len(self._skin.cubes)))
-        try:
-            for number in self.created:
-                self._store(number, rest)
-        except ConfigError as error:
-            response.success = False
-            response.message = str(error)
+        for number in self.created:
+            self._store(number, rest)
+        response.success = True
+        response.message = "rest frequencies are the calibrations' again"
         self._node.get_logger().info(f"clear_tare: {response.message}")
         return response
 
