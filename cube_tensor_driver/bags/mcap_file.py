@@ -10,7 +10,7 @@ one read per chunk instead of several per message. Source of the format: https:/
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from io import SEEK_END, BytesIO
@@ -31,7 +31,7 @@ from mcap.writer import CompressionType, Writer
 
 from ..config.yaml import to_yaml
 from ..core.arrays import AnyArray
-from .metadata import Connection, FileSummary, QosProfile, make_bag_information, parse_profiles
+from .metadata import Connection, FileSummary, make_bag_information, parse_profiles
 from .stored_messages import StoredMessages, join, join_in_blocks
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -309,33 +309,23 @@ class McapWriter:
         self._writer.start("ros2", library="cube_tensor_driver")
         self._schemas: dict[str, int] = {}
 
-    def add_topic(
-        self,
-        topic: str,
-        msgtype: str,
-        definition: str,
-        qos: Sequence[QosProfile],
-    ) -> int:
+    def add_topic(self, topic: Connection) -> int:
         """Add a topic to the file, which must happen before its first message is written.
-
-        Args:
-            topic: Name of the topic.
-            msgtype: Type of its messages, such as ``std_msgs/msg/String``.
-            definition: Text of the type's definition, with the definitions of the types of its
-                fields.
-            qos: Quality of service profiles that its publishers offered.
 
         Returns:
             The channel (number of the topic in the file), which `write` takes.
         """
-        if msgtype not in self._schemas:
-            text = definition.encode()
-            number = self._writer.register_schema(msgtype, "ros2msg", text)
-            self._schemas[msgtype] = number
-        schema = self._schemas[msgtype]
-        profiles = to_yaml(list(qos)) if qos else ""
-        about = {"offered_qos_profiles": profiles}
-        return self._writer.register_channel(topic, "cdr", schema, about)
+        name = topic.msgtype
+        if name not in self._schemas:
+            text = topic.definition.encode()
+            self._schemas[name] = self._writer.register_schema(name, "ros2msg", text)
+        profiles = to_yaml(list(topic.qos)) if topic.qos else ""
+        return self._writer.register_channel(
+            topic.topic,
+            "cdr",
+            self._schemas[name],
+            {"offered_qos_profiles": profiles},
+        )
 
     def write(
         self,

@@ -15,7 +15,6 @@ from .metadata import (
     METADATA_VERSION,
     Connection,
     FileSummary,
-    QosProfile,
     find_type_hash,
     make_bag_information,
     parse_profiles,
@@ -206,38 +205,25 @@ class SqliteWriter:
         self._types: set[str] = set()
         self._topics = 0
 
-    def add_topic(
-        self,
-        topic: str,
-        msgtype: str,
-        definition: str,
-        qos: Sequence[QosProfile],
-    ) -> int:
+    def add_topic(self, topic: Connection) -> int:
         """Add a topic to the file, which must happen before its first message is written.
-
-        Args:
-            topic: Name of the topic.
-            msgtype: Type of its messages, such as ``std_msgs/msg/String``.
-            definition: Text of the type's definition, with the definitions of the types of its
-                fields.
-            qos: Quality of service profiles that its publishers offered.
 
         Returns:
             The id of the topic in the file, which `write` takes.
         """
-        digest = find_type_hash(msgtype, definition)
-        if msgtype not in self._types:
-            self._types.add(msgtype)
+        digest = find_type_hash(topic.msgtype, topic.definition)
+        if topic.msgtype not in self._types:
+            self._types.add(topic.msgtype)
             self._database.execute(
                 "INSERT INTO message_definitions(topic_type, encoding, encoded_message_definition,"
                 " type_description_hash) VALUES (?, 'ros2msg', ?, ?)",
-                (msgtype, definition, digest),
+                (topic.msgtype, topic.definition, digest),
             )
         self._topics += 1
-        profiles = to_yaml(list(qos)) if qos else ""
+        profiles = to_yaml(list(topic.qos)) if topic.qos else ""
         self._database.execute(
             "INSERT INTO topics VALUES (?, ?, ?, 'cdr', ?, ?)",
-            (self._topics, topic, msgtype, profiles, digest),
+            (self._topics, topic.topic, topic.msgtype, profiles, digest),
         )
         return self._topics
 

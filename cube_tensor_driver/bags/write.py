@@ -9,6 +9,7 @@ this package.
 from __future__ import annotations
 
 import sqlite3
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -30,7 +31,7 @@ WRITE_ERRORS = (OSError, sqlite3.Error)
 """Exceptions that the libraries raise when writing fails, for example on a full disk."""
 
 
-@dataclass(kw_only=True)
+@dataclass
 class _Part:
     """The storage file that is being written; a bag can be divided into several.
 
@@ -41,57 +42,30 @@ class _Part:
         file: Writer of the file's format.
         channels: Name of each topic -> number by which the file identifies the topic.
         counts: Name of each topic -> number of messages written on it.
-        first_ns: Time of the message that was written first.
-        start_ns: Time of the earliest message.
-        end_ns: Time of the latest message.
-        messages: Number of messages written.
-        bytes: Total size of the serialised messages, in bytes.
+        first_ns: Time of the message that was written first; None: there is no message yet.
+        start_ns: Time of the earliest message; 0 without messages.
+        end_ns: Time of the latest message; 0 without messages.
+        n_bytes: Total size of the serialised messages, in bytes.
     """
 
     path: Path
     file: McapWriter | SqliteWriter
     channels: dict[str, int] = field(default_factory=dict)
-    counts: dict[str, int] = field(default_factory=dict)
-    first_ns: int = 0
+    counts: Counter[str] = field(default_factory=Counter)
+    first_ns: int | None = None
     start_ns: int = 0
     end_ns: int = 0
-    messages: int = 0
-    bytes: int = 0
+    n_bytes: int = 0
 
-    def count(
-        self,
-        topic: str,
-        time_ns: int,
-        size: int,
-    ) -> None:
-        """Include a message that has been written in the counts and times.
-
-        Args:
-            topic: Topic of the message.
-            time_ns: Time at which the message was received, in ns since the Unix epoch.
-            size: Size of the serialised message, in bytes.
-        """
-        if not self.messages:
+    def write(self, topic: str, time_ns: int, data: bytes) -> None:
+        """Write a message; arguments as those of `BagWriter.write`."""
+        self.file.write(self.channels[topic], time_ns, data)
+        if self.first_ns is None:
             self.first_ns = self.start_ns = self.end_ns = time_ns
         self.counts[topic] += 1
-        self.messages += 1
         self.start_ns = min(self.start_ns, time_ns)
         self.end_ns = max(self.end_ns, time_ns)
-        self.bytes += size
-
-    def summary(self, topics: Sequence[Connection]) -> FileSummary:
-        """Return the times and numbers of messages of the file.
-
-        Args:
-            topics: All topics of the bag.
-        """
-        counted = [replace(one, msgcount=self.counts[one.topic]) for one in topics]
-        return FileSummary(
-            self.path.name,
-            counted,
-            self.start_ns,
-            self.end_ns,
-        )
+        self.n_bytes += len(data)
 
 
 class BagWriter:
@@ -191,7 +165,8 @@ class BagWriter:
         )
         self._topics.append(one)  # each storage file that begins later gets the topic, too
         with self._report_failure():
-            self._connect(self._open_part(), one)
+            part = self._open_part()
+            part.channels[topic] = part.file.add_topic(one)
 
     def write(
         self,
@@ -210,9 +185,9 @@ class BagWriter:
             BagError: Writing to the disk failed; after that, nothing can be written any more.
         """
         part = self._open_part()
-        is_large = self._max_bytes and part.bytes >= self._max_bytes
-        duration_ns = time_ns - part.first_ns if part.messages else 0
-        is_long = self._max_ns and duration_ns >= self._max_ns
+        is_large = self._max_bytes and part.n_bytes >= self._max_bytes
+        first_ns = time_ns if part.first_ns is None else part.first_ns
+        is_long = self._max_ns and time_ns - first_ns >= self._max_ns
         if is_large or is_long:
             # `close` also writes metadata.yaml, so that all complete files can be read while the
             # recording continues in the next one.
@@ -221,8 +196,7 @@ class BagWriter:
                 self._begin_part()
             part = self._open_part()
         with self._report_failure():
-            part.file.write(part.channels[topic], time_ns, data)
-        part.count(topic, time_ns, len(data))
+            part.write(topic, time_ns, data)
         self.messages += 1
         self.bytes += len(data)
 
@@ -256,36 +230,24 @@ class BagWriter:
         name = f"{self.folder.resolve().name}_{len(self._complete)}{SUFFIXES[self._storage]}"
         path = self.folder / name
         file = McapWriter(path) if self._storage == "mcap" else SqliteWriter(path)
-        self._part = _Part(path=path, file=file)
+        self._part = part = _Part(path, file)
         for one in self._topics:
-            self._connect(self._part, one)
+            part.channels[one.topic] = file.add_topic(one)
 
     def _finish_part(self) -> None:
         """Complete the current storage file, and list it in metadata.yaml."""
         part = self._open_part()
-        summary = part.summary(self._topics)
+        summary = FileSummary(
+            part.path.name,
+            [replace(one, msgcount=part.counts[one.topic]) for one in self._topics],
+            part.start_ns,
+            part.end_ns,
+        )
         part.file.finish(summary)
         # The file is complete now. A failure in writing metadata.yaml must not close it again.
         self._part = None
         self._complete.append(summary)
         write_metadata(self.folder, self._storage, self._complete)
-
-    @staticmethod
-    def _connect(part: _Part, one: Connection) -> None:
-        """Add a topic to a storage file.
-
-        Args:
-            part: The storage file.
-            one: Topic with its type, definition and quality of service.
-        """
-        channel = part.file.add_topic(
-            one.topic,
-            one.msgtype,
-            one.definition,
-            one.qos,
-        )
-        part.channels[one.topic] = channel
-        part.counts[one.topic] = 0
 
     @contextmanager
     def _report_failure(self) -> Iterator[None]:

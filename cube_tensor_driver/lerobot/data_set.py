@@ -134,7 +134,10 @@ class DataSet:
             path.parent.mkdir(parents=True, exist_ok=True)
             # Dictionary encoding saves space only if values repeat. Measured ones rarely do.
             self._writer = pyarrow.parquet.ParquetWriter(
-                path, table.schema, compression="zstd", use_dictionary=False
+                path,
+                table.schema,
+                compression="zstd",
+                use_dictionary=False,
             )
         self._writer.write_table(table)
         self._frames += len(table)
@@ -148,12 +151,7 @@ class DataSet:
                 few = pixels[::PIXEL_STRIDE, ::PIXEL_STRIDE]
                 # LeRobot normalises images of the shape (bands, height, width), to which statistics
                 # of the shape (bands, 1, 1) are broadcast.
-                rows: AnyArray = few.reshape(
-                    -1,
-                    shape[2],
-                    1,
-                    1,
-                )
+                rows: AnyArray = few.reshape(-1, shape[2], 1, 1)
             else:
                 shape = values.shape[1:]
                 names = AXES[: len(shape)] if len(shape) > 1 else self._names.get(key)

@@ -199,7 +199,7 @@ class LiveWindows:
     def _write(self, rows: StressRows) -> None:
         """Write the rows (samples of cubes) of one frame as one batch of the Arrow stream."""
         n_cubes = len(self._level)
-        depth = int(np.bincount(rows.cube).max())
+        depth = int(np.bincount(rows.cube, minlength=1).max())
         first_frame = np.zeros(len(rows), np.intp)
         columns = arrange_windows(
             first_frame,
