@@ -262,7 +262,7 @@ def test_statistics_are_those_of_all_samples(made):
     assert np.shape(stats["observation.images.camera.image_raw"]["mean"]) == (3, 1, 1)
 
 
-def test_marks_divide_a_bag_into_episodes(made, tmp_path):
+def test_marks_divide_a_bag_into_episodes(made, tmp_path, capsys):
     bag, table, _ = made
     command = ["export", "lerobot", str(bag), str(bag), "-o", str(tmp_path / "set")]
     assert main([*command, "--fps", "30", "--marks", MARKS, "--topics", JOINTS]) == 0
@@ -281,6 +281,25 @@ def test_marks_divide_a_bag_into_episodes(made, tmp_path):
     pressed = (stamp_ns >= 500_000_000) & (stamp_ns < 1_200_000_000)
     assert frames[f"{TACTILE}.count"][:21].sum() == pressed.sum()
     assert list(frames)[8:-5] == ["observation.state"]
+    number = np.concatenate([np.arange(length) for length in (21, 45, 21, 45)])
+    np.testing.assert_array_equal(frames["frame_index"][:, 0], number)
+    seconds = (number / FPS).astype(np.float32)
+    np.testing.assert_array_equal(frames["timestamp"][:, 0], seconds)
+    written = int(frames[f"{TACTILE}.count"].sum())
+    text = capsys.readouterr().out
+    assert f"132 frames, {written} samples" in text
+    assert f"left out: {2 * len(table) - written} samples outside of the marks" in text
+
+
+def test_a_mark_ends_the_last_frame_of_its_episode(made, tmp_path):
+    """0.7 s are 9.1 frames at 13 frames per second; the tenth has no sample after the mark."""
+    bag, table, _ = made
+    command = ["export", "lerobot", str(bag), "-o", str(tmp_path / "set"), "--fps", "13"]
+    assert main([*command, "--marks", MARKS, "--topics"]) == 0
+    count = read_frames(tmp_path / "set")[f"{TACTILE}.count"]
+    stamp_ns = table["stamp_ns"].to_numpy() - START_NS
+    pressed = (stamp_ns >= 500_000_000) & (stamp_ns < 1_200_000_000)
+    assert count[9].any() and count[:10].sum() == pressed.sum()
 
 
 def test_a_topic_that_one_of_two_bags_lacks_is_unknown_there(made, tmp_path):
