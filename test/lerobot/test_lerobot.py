@@ -292,14 +292,14 @@ def test_marks_divide_a_bag_into_episodes(made, tmp_path, capsys):
 
 
 def test_a_mark_ends_the_last_frame_of_its_episode(made, tmp_path):
-    """0.7 s are 9.1 frames at 13 frames per second; the tenth has no sample after the mark."""
+    """0.7 s are 7.7 frames at 11 frames per second; the eighth has no sample after the mark."""
     bag, table, _ = made
-    command = ["export", "lerobot", str(bag), "-o", str(tmp_path / "set"), "--fps", "13"]
+    command = ["export", "lerobot", str(bag), "-o", str(tmp_path / "set"), "--fps", "11"]
     assert main([*command, "--marks", MARKS, "--topics"]) == 0
     count = read_frames(tmp_path / "set")[f"{TACTILE}.count"]
     stamp_ns = table["stamp_ns"].to_numpy() - START_NS
     pressed = (stamp_ns >= 500_000_000) & (stamp_ns < 1_200_000_000)
-    assert count[9].any() and count[:10].sum() == pressed.sum()
+    assert count[7].any() and count[:8].sum() == pressed.sum()
 
 
 def test_a_topic_that_one_of_two_bags_lacks_is_unknown_there(made, tmp_path):
