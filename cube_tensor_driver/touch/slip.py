@@ -18,13 +18,23 @@ the same. If a sticking body is pulled at a point above the surface, its centre 
 too, but in proportion to the change of the ratio. A body that rolls moves without a shear force
 along its path.
 
+While only the rim of the contact slips (partial slip), the shear force is distributed differently,
+so that the values y of the cubes are not proportional to it. A least-squares fit, with the change n
+of the normal force and the change q of the shear force, shows this by its last term::
+
+    y = y0 + a n + B q + C |q| q
+
+For a ball, |C |q| q| / |B q + C |q| q| is about 0.1 at 60 % of the largest shear force that
+friction holds, and 0.2 at the largest one. For a flat punch, which has no partial slip, it is 0.
+The linear terms take up errors of gains and elastomer.
+
 Source: K. L. Johnson, Contact Mechanics (1985), 7.1 (sliding) and 7.2 (partial slip).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -132,6 +142,19 @@ NEIGHBOUR_PITCHES = 3.0
 changes of the cubes' values are attributed to changes of both contacts."""
 
 
+MAX_NORMAL_CHANGE = 0.05
+"""Largest change of the normal force, divided by the force, during which it counts as constant for
+`Slip.partial`. With a linear correction for it, changes of 2 % did not change the result."""
+
+MAX_SHIFT_M = 2e-4
+"""Largest motion of a contact, in m, for which `Slip.partial` is known. Half of it gave values up
+to 0.05 in simulations of flat punches; 1 mm changes the stresses as much as partial slip does."""
+
+PARTIAL_DEVIATION = 0.01
+"""Largest standard deviation of `Slip.partial` due to the noise of the pads; it is unknown if its
+deviation is larger, as while the shear force has changed little."""
+
+
 class Slip(NamedTuple):
     """State and friction of n contacts.
 
@@ -143,6 +166,10 @@ class Slip(NamedTuple):
             before the first slip.
         velocity: Velocity (n, 3) of slip in m/s, in the skin's parent frame; 0 without slip, NaN if
             the state is unknown.
+        partial: Part (n,) of the change of the cubes' values, since the normal force has been
+            constant, that is not proportional to the change of the shear force, divided by this
+            change; a sign of partial slip. NaN if the normal force changes, the contact moves, or
+            the shear force has changed too little.
     """
 
     state: Index
@@ -150,6 +177,7 @@ class Slip(NamedTuple):
     friction_uncertainty: Array
     friction_use: Array
     velocity: Array
+    partial: Array
 
 
 NO_CONTACTS = Slip(
@@ -158,6 +186,7 @@ NO_CONTACTS = Slip(
     friction_uncertainty=np.zeros(0),
     friction_use=np.zeros(0),
     velocity=np.zeros((0, 3)),
+    partial=np.zeros(0),
 )
 """State and friction if nothing presses on the skin: empty arrays."""
 
@@ -190,8 +219,15 @@ class SlipEstimator:
         # changes of these values to changes of the load. `linearised` is the load for which this
         # matrix was computed, and `noise` the standard deviation of the position, in m. `sums` are
         # those of `_add_ratio`. `past` has the motion states (`_decide_motion_state`) of the last
-        # scans, newest first.
-        fields: list[tuple[str, type, tuple[int, ...]]] = [
+        # scans, newest first. `first` are cubes, weights and values at the begin of the fit of
+        # `Slip.partial`, `terms` are its terms in the newest scan, and `gram` and `moments` the
+        # sums of their products with each other and with the changes of the values.
+        linear: list[tuple[str, type, tuple[int, ...]]] = [
+            ("cubes", int, (count,)),
+            ("weights", float, (6, n_values)),
+            ("values", float, (n_values,)),
+        ]
+        fields: list[tuple[str, Any, tuple[int, ...]]] = [
             ("id", int, ()),
             ("normal", float, (3,)),
             ("radius", float, ()),
@@ -200,13 +236,16 @@ class SlipEstimator:
             ("slips", bool, ()),
             ("is_fitted", bool, ()),
             ("sums", float, (3,)),
-            ("cubes", int, (count,)),
-            ("weights", float, (6, n_values)),
+            *linear,
             ("noise", float, ()),
-            ("values", float, (n_values,)),
             ("load", float, (6,)),
             ("linearised", float, (6,)),
             ("past", float, (n_scans, 7)),
+            ("first", linear, ()),
+            ("partial", float, ()),
+            ("terms", float, (8,)),
+            ("gram", float, (8, 8)),
+            ("moments", float, (8, n_values)),
         ]
         self._contacts: AnyArray = np.zeros(0, fields)
         self._times = np.full(n_scans, -np.inf)
@@ -243,6 +282,7 @@ class SlipEstimator:
             self.slip = NO_CONTACTS
             return
 
+        contacts["partial"] = self._estimate_partial_slip()
         normal = contacts["normal"]
         followed = self._follow(scaled)
         before = _decide_motion_state(followed, normal)
@@ -286,6 +326,7 @@ class SlipEstimator:
         scaled = self._inverse.scaled(values)
         loads = self._follow(scaled)
         self._linearise_changed(loads, scaled)
+        self._observe_shear(scaled)
         newest = _decide_motion_state(loads, contacts["normal"])
         self._remember(time_s, newest)
 
@@ -331,8 +372,51 @@ class SlipEstimator:
             friction_uncertainty=uncertainty,
             friction_use=ratio / friction,
             velocity=velocity,
+            partial=np.where(sticks, contacts["partial"], np.nan),
         )
         return bool(begins.any())
+
+    def _observe_shear(self, scaled: Array) -> None:
+        """Add the values (cubes, C) of a scan, in Pa, to the fits of `Slip.partial`.
+
+        A fit starts again when the normal force or the position has changed, or the contact slips.
+        """
+        contacts = self._contacts
+        # The weights of the first scan are kept, because others would change the shear force, too.
+        first = contacts["first"]
+        values = scaled[first["cubes"]].reshape(len(contacts), -1)
+        change = np.nan_to_num(values - first["values"])
+        load = np.einsum("nkm,nm->nk", first["weights"], change)
+        normal = contacts["normal"]
+        outward = np.einsum("nk,nk->n", load[:, :3], normal)[:, None]
+        shear = load[:, :3] - outward * normal
+        curved = _compute_lengths(shear)[:, None] * shear
+        terms = np.hstack([np.ones_like(outward), outward, shear, curved])
+        contacts["terms"] = terms
+        contacts["gram"] += terms[:, :, None] * terms[:, None]
+        contacts["moments"] += terms[:, :, None] * change[:, None]
+
+        force = _compute_lengths(contacts["load"][:, :3])
+        is_over = np.abs(outward[:, 0]) > MAX_NORMAL_CHANGE * force
+        is_over |= _compute_lengths(load[:, 3:]) > MAX_SHIFT_M
+        is_over |= contacts["slips"] | (contacts["gram"][:, 2, 2] == 0)
+        for name in ("cubes", "weights", "values"):
+            first[name][is_over] = contacts[name][is_over]
+        contacts["gram"][is_over] = contacts["moments"][is_over] = 0
+
+    def _estimate_partial_slip(self) -> Array:
+        """Return `Slip.partial` (n,)."""
+        contacts = self._contacts
+        terms, curved = contacts["terms"], contacts["terms"][:, 5:]
+        inverse = np.linalg.pinv(contacts["gram"], rcond=1e-9, hermitian=True)
+        parts = terms[:, :, None] * (inverse @ contacts["moments"])
+        change = _compute_lengths(parts[:, 2:].sum(axis=1))
+        by_pad = np.nan_to_num(self._inverse.by_pad[contacts["first"]["cubes"]])
+        covariance = (by_pad**2).sum(axis=(1, 2, 3))[:, None, None] * inverse[:, 5:, 5:]
+        variance = np.einsum("nk,nkl,nl->n", curved, covariance, curved)
+        with np.errstate(invalid="ignore"):
+            share = _compute_lengths(parts[:, 5:].sum(axis=1)) / change
+        return np.where(variance < (PARTIAL_DEVIATION * change) ** 2, share, np.nan)
 
     def _test_lags(
         self,

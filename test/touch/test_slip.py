@@ -33,7 +33,7 @@ class Run:
     def __init__(self, bench: TractionBench, values: Array) -> None:
         tracker = ContactTracker(bench.inverse, CONTACT_PRESSURE)
         self.estimator = SlipEstimator(bench.inverse)
-        self.states, self.velocity, self.begun = [], [], []
+        self.states, self.velocity, self.partial, self.begun = [], [], [], []
         for number, scan in enumerate(values):
             if number % TRACKED_SCANS == 0:
                 self.estimator.adopt(tracker.update(scan), scan)
@@ -42,6 +42,7 @@ class Run:
             (state,) = self.estimator.slip.state
             self.states.append(state)
             self.velocity.append(self.estimator.slip.velocity[0])
+            self.partial.append(self.estimator.slip.partial[0])
 
 
 def random_body(random: np.random.Generator) -> Body:
@@ -77,6 +78,33 @@ def test_gross_slip_is_reported_within_10_ms_with_its_friction(benches, seed):
     assert slip.friction_use[0] == pytest.approx(1, abs=0.05)
     velocity = np.mean(run.velocity[100:], axis=0)
     np.testing.assert_allclose(velocity[:2], speed * along, atol=0.25 * speed)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_partial_slip_of_a_ball_is_told_from_a_punch_which_has_none(benches, seed):
+    """Both are pulled up to 79 % of what friction holds, while the normal force changes by 2 %."""
+    random = np.random.default_rng(seed)
+    bench, normal = benches[seed], random.uniform(3, 8)
+    angle, friction = random.uniform(0, 6), random.uniform(0.4, 0.9)
+    along, centre = np.array([np.cos(angle), np.sin(angle)]), 6e-3 * (random.random(2) - 0.5)
+    found = {}
+    for body in (Body(friction, 12e-3, True), Body(friction, 4e-3, False)):
+        skin, pads = RubbedSkin(bench, random), []
+        for number in range(211):
+            pressing = normal * (1 + 0.02 * np.sin(number / 17))
+            share = 0.95 * max(0, number - 20) / 230
+            pull = share * friction * pressing * along
+            pads.append(skin.pads(body, pressing, pull, centre))
+        run = Run(bench, skin.measure(np.array(pads)))
+        assert SLIP not in run.states
+        found[body.is_ball] = np.array(run.partial)
+    # Shares of the largest shear force of 33 %, 54 % and 74 %.
+    scans = [100, 150, 200]
+    assert found[False][scans] == pytest.approx(0, abs=0.015)
+    early, middle, late = found[True][scans]
+    assert 0.03 < early < 0.1 and 0.06 < middle < 0.17 and 0.09 < late < 0.3
+    assert early < middle < late
+    assert np.isnan(found[True][20])
 
 
 def test_the_noise_of_a_light_contact_is_no_motion_and_does_not_hide_its_slip(benches):
