@@ -42,7 +42,7 @@ def add_arguments(parser: Parser) -> None:
         "--contacts",
         nargs="*",
         metavar=("METHOD", "KEY:=VAL"),
-        help="add contacts and traction, as the node contacts makes them, with method:=METHOD "
+        help="add touch, contacts and traction, as the nodes make them, with method:=METHOD "
         "and its other parameters: depth:=0.005 thickness:=0.011 rate:=20",
     )
     parser.add_jobs()

@@ -181,10 +181,10 @@ RECONSTRUCTION = (
     ),
     Parameter(
         "touch_false_alarms",
-        0.0,
-        "Rate, per hour, at which noise alone is taken for a touch somewhere on the skin. With a "
-        "value such as 1.0 the node publishes the touches of every scan on `touch`. With 0 it "
-        "looks for none.",
+        1.0,
+        "Rate, per hour, at which noise alone is taken for a touch somewhere on the skin. The node "
+        "publishes the touches of every scan on `touch` while it has a subscriber. With 0 there is "
+        "no such topic.",
         span=(0.0, 3600.0),
         minimum=1e-3,
     ),

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..core.arrays import Array
+from ..core.arrays import Array, Index
 from ..core.errors import BagError
 from ..touch.slip import NO_CONTACTS, SLIP, Slip
 from ..touch.surface import Contact
+from ..touch.touch_detection import NO_TOUCHES
 from ..touch.tracker.contact_tracker import TrackedContact
 from .point_cloud import MakeMessage, make_cloud_message, make_header
 from .types import CONTACTS
@@ -67,6 +68,7 @@ def make_contacts_message(
     frame_id: str,
     contacts: Sequence[Contact] | Sequence[TrackedContact],
     slip: Slip = NO_CONTACTS,
+    touch_id: Index = NO_TOUCHES.id,
 ) -> object:
     """Make a SkinContacts message.
 
@@ -76,6 +78,7 @@ def make_contacts_message(
         frame_id: Coordinate frame of the positions, normals and forces.
         contacts: The contacts: all with a tracker (`TrackedContact`) or all without one.
         slip: State and friction of these contacts; without a tracker the default, empty arrays.
+        touch_id: Numbers of the touches of these contacts; without a tracker an empty array.
     """
     # Only tracked contacts have an id, a moment (torque about the normal), further uncertainties,
     # and `refined` (force from a fit of the traction). Without a tracker, these arrays stay empty.
@@ -85,12 +88,14 @@ def make_contacts_message(
     fields: dict[str, object] = {name: _collect(contacts, name) for name in _NUMBERS}
     fields |= {name: _collect(tracked, name) for name in _TRACKED_NUMBERS}
     fields["id"] = np.array(ids, np.uint32)
+    fields["touch_id"] = touch_id
     fields["refined"] = np.array(are_refined, bool)
     for name, kind in _VECTORS.items():
         vectors = [getattr(contact, name) for contact in contacts]
         fields[name] = [_make_xyz(make, kind, vector) for vector in vectors]
     fields["slip"] = slip.state.astype(np.uint8)
     fields |= {name: getattr(slip, name) for name in _FRICTION}
+    fields["partial_slip"] = slip.partial
     fields["slip_velocity"] = [_make_xyz(make, "Vector3", one) for one in slip.velocity]
     header = make_header(make, stamp_ns, frame_id)
     return make(CONTACTS, header=header, **fields)

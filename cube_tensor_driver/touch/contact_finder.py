@@ -12,7 +12,7 @@ import numpy as np
 
 from ..config.influence import find_influence
 from ..config.skin import Elastomer
-from ..core.arrays import Array, PadMasks, StatusBits
+from ..core.arrays import Array, Index, PadMasks, StatusBits
 from ..core.calibration import Calibration
 from ..core.defaults import CONTACT_METHODS, CONTACT_PRESSURE, SURFACE_DEPTH
 from ..core.pipeline import Pipeline
@@ -25,6 +25,8 @@ from .pad_measurement import model_pads
 from .pad_noise import compute_noise_by_pad, compute_noise_of_all_pads
 from .slip import NO_CONTACTS, Slip, SlipEstimator
 from .surface import Contact, Surface
+from .touch_detection import NO_TOUCHES, Touches
+from .touch_links import TouchLinks
 from .tracker.contact_tracker import ContactTracker, TrackedContact
 
 AUTO = CONTACT_METHODS[0]
@@ -104,12 +106,17 @@ class ContactFinder(Protocol):
     def slip(self) -> Slip:
         """Newest slip state and friction of `contacts`; empty if the method is interpolation."""
 
+    @property
+    def touch_id(self) -> Index:
+        """Number of the touch of each of `contacts`; empty if the method is interpolation."""
+
     def update(
         self,
         time_s: float,
         values: Array,
         left_out: PadMasks,
         status: StatusBits,
+        touches: Touches = NO_TOUCHES,
     ) -> None:
         """Find the contacts in the newest values.
 
@@ -120,6 +127,7 @@ class ContactFinder(Protocol):
                 was not used for `values`.
             status: Status bits (cubes,) of `values`. Where COMPENSATION is set, the method inverse
                 finds a new contact only if its pressure is above `UNCERTAIN_PRESSURE`.
+            touches: Touches in the newest scan.
         """
 
     def follow(self, time_s: float, values: Array) -> bool:
@@ -179,6 +187,7 @@ class _InterpolationFinder:
         self._threshold = settings.least
         self.contacts: list[Contact] = []
         self.slip = NO_CONTACTS
+        self.touch_id = NO_TOUCHES.id
 
     def update(
         self,
@@ -186,6 +195,7 @@ class _InterpolationFinder:
         values: Array,
         left_out: PadMasks,
         status: StatusBits,
+        touches: Touches = NO_TOUCHES,
     ) -> None:
         self.contacts = self._surface.contacts(values, self._threshold)
 
@@ -227,7 +237,9 @@ class _InverseFinder:
         )
         self._tracker = ContactTracker(self._inverse, settings.least)
         self._slip = SlipEstimator(self._inverse)
+        self._links = TouchLinks(poses)
         self.contacts: list[TrackedContact] = []
+        self.touch_id = NO_TOUCHES.id
 
     @property
     def slip(self) -> Slip:
@@ -239,6 +251,7 @@ class _InverseFinder:
         values: Array,
         left_out: PadMasks,
         status: StatusBits,
+        touches: Touches = NO_TOUCHES,
     ) -> None:
         # The noise of a cube's components depends on the pads in use. So the noise matrices are
         # computed again for cubes whose pads in use have changed since the last scan.
@@ -250,6 +263,7 @@ class _InverseFinder:
         self.contacts = self._tracker.update(values, status & COMPENSATION != 0)
         self._slip.adopt(self.contacts, values)
         self._slip.update(time_s, values)
+        self.touch_id = self._links.link(self.contacts, touches)
 
     def follow(self, time_s: float, values: Array) -> bool:
         return self._slip.update(time_s, values)

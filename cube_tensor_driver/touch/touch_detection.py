@@ -40,8 +40,10 @@ from .touch_forces import estimate_forces
 FALSE_ALARMS = 1.0
 """Default rate of touches found in noise alone, per hour, of the whole skin."""
 
-DEFAULT_RATE_HZ = 1000.0
-"""Sampling rate of each cube, in Hz, that is assumed if the skin file states none."""
+MIN_RATE_HZ = 1000.0
+"""Smallest sampling rate of each cube, in Hz, for which the rate of false alarms holds. At a lower
+rate, they are rarer. A recording, which does not state its rate, therefore gives the same touches.
+"""
 
 TIME_CONSTANT_S = 1.0
 """Time constant, in s, of the high-pass that removes slow drift from the pressure of a cube. The
@@ -102,8 +104,11 @@ standard deviations of the noise, at which the slow part starts again. So large 
 the slow part had adapted to a load, which has ended now."""
 
 STALE_NS = 1_000_000_000
-"""Maximum age, in ns, of the newest sample of a cube, relative to the newest sample of all cubes.
-If it is older, the cube counts as untouched, and its next sample starts the detection again."""
+"""Maximum time, in ns, from the last sample of a cube to the newest sample of all cubes. After a
+longer time, the cube counts as untouched, and its next sample starts the detection again."""
+
+NO_TOUCH = -1
+"""Number in place of the number of a touch where there is no touch."""
 
 PRESSURE = COMPONENTS.index("zz")
 """Index in `COMPONENTS` of the stress zz, whose negative is the pressure."""
@@ -115,6 +120,8 @@ class Touches(NamedTuple):
     Attributes:
         stamp_ns: Time of the earliest sample of the scan, in ns of the source's clock.
         cube: Indices (m,) of the cubes with a larger pressure than their neighbours.
+        id: Numbers (m,) of the touches, which stay the same from begin to end: `stamp_ns` of the
+            first scan of the touch, plus 1, 2, ... if several touches begin in the same scan.
         pressure: Pressure (m,) in Pa at the centre of this cube, without its slow part (an average
             that follows slow drift).
         pressure_uncertainty: Standard deviation (m,) of `pressure`, in Pa.
@@ -126,6 +133,7 @@ class Touches(NamedTuple):
 
     stamp_ns: int
     cube: Index
+    id: Index
     pressure: Array
     pressure_uncertainty: Array
     force: Array
@@ -139,6 +147,7 @@ class Touches(NamedTuple):
 NO_TOUCHES = Touches(
     stamp_ns=0,
     cube=np.zeros(0, np.intp),
+    id=np.zeros(0, np.intp),
     pressure=np.zeros(0),
     pressure_uncertainty=np.zeros(0),
     force=np.zeros((0, 3)),
@@ -167,8 +176,8 @@ class Touch:
         Args:
             skin: Skin as from `read_skin`, or the path of a skin file.
             false_alarms: Rate of touches found in noise alone, per hour, of the whole skin. It
-                holds for noise as in the calibrations, for drift up to `MAX_DRIFT`, and at the
-                sampling rate in the skin file.
+                holds for noise as in the calibrations, for drift up to `MAX_DRIFT`, and at 1 kHz
+                or a higher rate in the skin file.
 
         Raises:
             ConfigError: The rate is not above 0.
@@ -183,7 +192,7 @@ class Touch:
         )
         skin = as_skin(skin)
         n = len(skin.calibrations)
-        rate_hz = skin.rate or DEFAULT_RATE_HZ
+        rate_hz = max(skin.rate or 0.0, MIN_RATE_HZ)
         tests_per_alarm = 3600 * rate_hz * n / false_alarms
         log_ratio = math.log(2 * REFERENCE**2 * tests_per_alarm)
         limit = log_ratio / (2 * REFERENCE)
@@ -219,6 +228,8 @@ class Touch:
         # above the noise, the slow part is held (`_held`), so that it does not adapt to the load.
         self._reach = np.zeros(n)
         self._held = np.zeros(n, bool)
+        # The number of the touch that each cube belonged to in the last scan.
+        self._id = np.full(n, NO_TOUCH)
 
     def __repr__(self) -> str:
         touched = np.count_nonzero(self._touched)
@@ -238,19 +249,22 @@ class Touch:
 
         Args:
             rows: Rows of one scan, or of several scans one after the other. Within a scan, they are
-                sorted by the number of the cube.
+                sorted by the number of the cube. Rows of other cubes than those of the skin are
+                ignored.
 
         Returns:
             The touches of each scan. They do not depend on how many scans are given in one call.
         """
+        is_known = rows.cube < len(self._sum)
+        if not is_known.all():
+            rows = rows.select(is_known)
         is_first = rows.cube[1:] <= rows.cube[:-1]
         starts = np.flatnonzero(is_first) + 1
-        bounds = sorted({0, *starts.tolist(), len(rows)})
-        touches = []
-        for start, end in pairwise(bounds):
-            scan = rows.select(slice(start, end))
-            touches.append(self._update_scan(scan))
-        return touches
+        if not len(starts):
+            return [self._update_scan(rows)] if len(rows) else []
+        bounds = [0, *starts.tolist(), len(rows)]
+        scans = [rows.select(slice(*ends)) for ends in pairwise(bounds)]
+        return [self._update_scan(scan) for scan in scans]
 
     __call__ = update
 
@@ -263,14 +277,23 @@ class Touch:
         if changed.any():
             self._use_pads(rows.cube[changed], rows.left_out[changed])
 
+        oldest_ns = rows.stamp_ns.max() - STALE_NS
+        stale = self._stamp_ns < oldest_ns
+        if stale.any():
+            self._slow[stale] = np.nan
+            self._change[stale] = 0
+            self._count[stale] = 0
+            self._sum[stale] = 0
+            self._touched[stale] = False
+
         elapsed_ns = rows.stamp_ns - self._stamp_ns[cube]
         elapsed_s = (1e-9 * elapsed_ns).clip(0, TIME_CONSTANT_S)
         self._stamp_ns[cube] = rows.stamp_ns
 
-        values = rows.components.astype(float)
+        values = np.hstack([rows.stress, rows.gradient], dtype=float)
         slow = self._slow[cube]
         is_unknown = np.isnan(slow)
-        if is_unknown.any():
+        if not np.array_equal(is_unknown, self._unobserved[cube]):
             # An unknown slow part starts at the newest value minus the last known difference of
             # value and slow part. Otherwise a load that lasts would be taken for drift.
             load = np.nan_to_num(self._change[cube])
@@ -284,14 +307,6 @@ class Touch:
         self._slow[cube] = slow + gain[:, None] * change
         self._count[cube] += 1
 
-        oldest_ns = rows.stamp_ns.max() - STALE_NS
-        stale = self._stamp_ns < oldest_ns
-        if stale.any():
-            self._slow[stale] = np.nan
-            self._change[stale] = 0
-            self._count[stale] = 0
-            self._sum[stale] = 0
-            self._touched[stale] = False
         return self._locate(int(rows.stamp_ns.min()))
 
     def _restart(self, cubes: Index) -> None:
@@ -389,6 +404,7 @@ class Touch:
         if not self._touched.any():
             self._reach[:] = 0
             self._held[:] = False
+            self._id[:] = NO_TOUCH
             return NO_TOUCHES._replace(stamp_ns=stamp_ns)
         pressure = -self._change[:, PRESSURE]
         strength = np.where(self._touched, pressure, 0)
@@ -407,6 +423,7 @@ class Touch:
         cube = np.flatnonzero(is_largest & is_own)
         order = np.argsort(-pressure[cube], kind="stable")
         cube = cube[order]
+        number = self._number(cube, strength, stamp_ns)
         own = pressure[cube]
         margin = self._margin[cube]
         gain_deviation = GAIN_ERROR * own
@@ -419,11 +436,40 @@ class Touch:
         return Touches(
             stamp_ns=stamp_ns,
             cube=cube,
+            id=number,
             pressure=own,
             pressure_uncertainty=np.sqrt(variance),
             force=force,
             force_uncertainty=force_deviation,
         )
+
+    def _number(self, cube: Index, strength: Array, stamp_ns: int) -> Index:
+        """Return the numbers (m,) of the touches of this scan.
+
+        A touch has the number that its cube belonged to in the scan before. From each cube the way
+        up to the neighbour with the largest pressure leads to the touch that it belongs to.
+
+        Args:
+            cube: Indices (m,) of the cubes of the touches, the one with the largest pressure first.
+            strength: Pressure (cubes,) of the touched cubes, 0 elsewhere.
+            stamp_ns: Time of the earliest sample of the scan, in ns.
+        """
+        number = self._id[cube]
+        _, first = np.unique(number, return_index=True)
+        is_new = number == NO_TOUCH
+        # Of several touches with the same number, the one with the largest pressure keeps it.
+        is_new[np.delete(np.arange(len(cube)), first)] = True
+        number[is_new] = stamp_ns + np.arange(np.count_nonzero(is_new))
+
+        every_cube = np.arange(len(strength))
+        largest = strength[self._near].argmax(axis=0)
+        top = self._near[largest, every_cube]
+        while (top[top] != top).any():
+            top = top[top]
+        self._id[~self._touched] = NO_TOUCH
+        self._id[cube] = number
+        self._id = self._id[top]
+        return number
 
     def _estimate_forces(self, cube: Index, share: Array) -> tuple[Array, Array]:
         """Return the forces (m, 3) at m cubes and their standard deviations (m, 3), in N.

@@ -225,8 +225,9 @@ def distinct(kind: Callable, number: int) -> Contact | TrackedContact:
 def test_each_number_of_a_contact_is_in_its_field(kind):
     contacts = [distinct(kind, number) for number in range(3)]
     numbers = np.arange(1.0, 10).reshape(3, 3) / 7
-    slip = Slip(np.array([UNKNOWN, STICK, SLIP]), *numbers, numbers + 5)
-    message = make_contacts_message(make_message, START_NS + 5, "wrist", contacts, slip)
+    slip = Slip(np.array([UNKNOWN, STICK, SLIP]), *numbers, numbers + 5, numbers[0] + 9)
+    touches = np.array([START_NS, -1, START_NS + 1])
+    message = make_contacts_message(make_message, START_NS + 5, "wrist", contacts, slip, touches)
     assert message.header.frame_id == "wrist"
     assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == START_NS + 5
     for name in ("position", "normal", "force"):
@@ -240,6 +241,8 @@ def test_each_number_of_a_contact_is_in_its_field(kind):
         ("friction", "friction_uncertainty", "friction_use"), numbers, strict=True
     ):
         np.testing.assert_array_equal(getattr(message, name), expected)
+    np.testing.assert_array_equal(message.partial_slip, slip.partial)
+    np.testing.assert_array_equal(message.touch_id, touches)
     got = [[one.x, one.y, one.z] for one in message.slip_velocity]
     np.testing.assert_array_equal(got, slip.velocity)
     assert message.slip.tolist() == [message.UNKNOWN, message.STICK, message.SLIP] == [0, 1, 2]

@@ -44,6 +44,8 @@ from cube_tensor_driver.touch.contact_finder import ContactSettings
 FRAME = b"skin_base\0"
 FORCE = np.array([0.5, 0.0, -2.0])
 SCANS = 5
+IDLE_SCANS = 12
+"""Scans before the load, with which the detection of touch begins."""
 ELASTOMER = Elastomer(depth=5e-3, thickness=np.inf, poisson=0.46)
 """Half space whose depth and Poisson's ratio are not the defaults."""
 
@@ -193,7 +195,7 @@ def test_contacts_and_traction_of_a_pressed_skin_live_and_out_of_a_bag(ros, tmp_
     from rclpy.serialization import deserialize_message, serialize_message
     from sensor_msgs.msg import PointCloud2
 
-    from cube_tensor_driver.msg import SkinContacts, SkinInfo, SkinStress
+    from cube_tensor_driver.msg import SkinContacts, SkinInfo, SkinStress, SkinTouch
     from cube_tensor_driver.processes.children import Children
     from cube_tensor_driver.processes.skin_processes import Process
     from cube_tensor_driver.ros.messages import make_info_message
@@ -203,24 +205,33 @@ def test_contacts_and_traction_of_a_pressed_skin_live_and_out_of_a_bag(ros, tmp_
     described = make_info_message(skin, Pipeline(skin.calibrations), time.time_ns())
     described.sender = "reconstruction"
     scans = [frequencies(skin, middle + np.array([2e-4 * number, 0])) for number in range(SCANS)]
+    rest = np.array([one.rest_frequency for one in skin.calibrations])
+    noise = np.random.default_rng(2).standard_normal((IDLE_SCANS, *rest.shape))
+    scans = [*(rest * (1 + FREQUENCY_NOISE * noise)), *scans]
     bag = bag_of(tmp_path / "bag", skin, serialize_message(described), scans)
     with open_bag(bag) as source:
         assert source.skin.elastomer == ELASTOMER
     result = tmp_path / "out"
     wanted = ContactOptions(ContactSettings(), rate=50.0)
     reprocess(ReprocessJob(bag, result, "bag", contacts=wanted))
-    stress = messages(result, "/stress")
-    expected = [messages(result, topic) for topic in ("/contacts", "/traction")]
+    stress, touches = (messages(result, topic)[IDLE_SCANS:] for topic in ("/stress", "/touch"))
+    topics = ("/contacts", "/traction")
+    expected = [messages(result, topic)[IDLE_SCANS:] for topic in topics]
     stated = ContactSettings("inverse", depth=ELASTOMER.depth, poisson=ELASTOMER.poisson)
     wanted = ContactOptions(stated, rate=50.0)
     reprocess(ReprocessJob(bag, tmp_path / "stated", "bag", contacts=wanted))
-    assert messages(tmp_path / "stated", "/contacts") == expected[0]
-    assert [len(one) for one in expected] == [SCANS, SCANS] and len(stress) == SCANS
+    assert messages(tmp_path / "stated", "/contacts")[IDLE_SCANS:] == expected[0]
+    assert {len(one) for one in (*expected, stress, touches)} == {SCANS}
+    # Touch begins with the first scan under load, and keeps the number that states its time.
+    begin = deserialize_message(stress[0], SkinStress).header.stamp
+    found = [deserialize_message(data, SkinTouch) for data in touches]
+    assert {tuple(one.id) for one in found} == {(begin.sec * 10**9 + begin.nanosec,)}
 
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     info = ros.node.create_publisher(SkinInfo, "info", latched)
     info.publish(described)
     publisher = ros.node.create_publisher(SkinStress, "stress", 10)
+    touch_publisher = ros.node.create_publisher(SkinTouch, "touch", 10)
     contacts = ros.listen(SkinContacts, "contacts")
     clouds = ros.listen(PointCloud2, "traction")
     untouched = StressRows.of(
@@ -236,7 +247,10 @@ def test_contacts_and_traction_of_a_pressed_skin_live_and_out_of_a_bag(ros, tmp_
         if any(one[-1].header.stamp != stamp for one in (contacts, clouds)):
             return False
         # A contact that begins to slip is reported first at the place of the scan before.
-        return abs(contacts[-1].position[0].x - wanted.position[0].x) < 1e-5
+        return (
+            abs(contacts[-1].position[0].x - wanted.position[0].x) < 1e-5
+            and contacts[-1].touch_id == wanted.touch_id
+        )
 
     with Children(tmp_path) as children:
         given = {"rate": 100.0}
@@ -246,6 +260,8 @@ def test_contacts_and_traction_of_a_pressed_skin_live_and_out_of_a_bag(ros, tmp_
         ros.wait(ready)
         live = []
         for number, data in enumerate(stress):
+            touch_publisher.publish(touches[number])
+            time.sleep(0.05)  # two topics may arrive in any order
             publisher.publish(data)
             ros.wait(partial(answered, deserialize_message(expected[0][number], SkinContacts)))
             live.append((contacts[-1], clouds[-1]))
@@ -258,6 +274,7 @@ def test_contacts_and_traction_of_a_pressed_skin_live_and_out_of_a_bag(ros, tmp_
         np.testing.assert_allclose(numbers(touch), numbers(again), rtol=1e-7)
         surface = deserialize_message(expected[1][number], PointCloud2)
         np.testing.assert_allclose(points_of(cloud), points_of(surface), rtol=1e-4, atol=1e-2)
+        assert list(touch.touch_id) == list(found[number].id)
         assert list(touch.id) == [0] and touch.header.frame_id == skin.parent_frame
     last, cloud = live[-1]
     centre = middle + np.array([2e-4 * (SCANS - 1), 0])

@@ -63,6 +63,7 @@ def test_each_number_of_a_touch_is_in_its_field():
     touches = Touches(
         stamp_ns=START_NS,
         cube=np.array([3, 5]),
+        id=np.array([START_NS, START_NS + 1]),
         pressure=np.array([1.0, 2.0]),
         pressure_uncertainty=np.array([3.0, 4.0]),
         force=np.array([[5.0, 6.0, 7.0], [8.0, 9.0, 10.0]]),
@@ -71,6 +72,7 @@ def test_each_number_of_a_touch_is_in_its_field():
     topic.publish(publisher._make_message(touches))
     (message,) = topic.heard
     assert to_ns(message.header.stamp) == START_NS and list(message.cube) == [3, 5]
+    assert list(message.id) == [START_NS, START_NS + 1]
     expected = {
         "pressure": [1, 2],
         "pressure_uncertainty": [3, 4],
@@ -94,6 +96,13 @@ def test_touch_of_each_scan_is_published():
     load = np.hstack([stress, slope[:, :3].reshape(16, 9)])
     idle = np.zeros((16, 15))
 
+    # Without a subscriber nothing is computed. The first scan of one starts the set-up.
+    topic.subscribers = 0
+    publisher.publish(scan(-2, load), 0)
+    assert publisher._future is None
+    topic.subscribers = 1
+    publisher.publish(scan(-1, load), 0)
+    publisher._future.result()
     publisher.publish(concatenate([scan(number, idle) for number in range(60)]), 0)
     assert len(topic.heard) == 60 and not any(message.cube for message in topic.heard)
     stamps_ns = [to_ns(message.header.stamp) for message in topic.heard]
@@ -104,6 +113,7 @@ def test_touch_of_each_scan_is_published():
     assert message.header.frame_id == skin.parent_frame
     assert to_ns(message.header.stamp) == START_NS + 60_000_000
     assert list(message.cube) == [5]
+    assert list(message.id) == [START_NS + 60_000_000]
     assert message.pressure[0] == pytest.approx(-stress[5, 2], rel=1e-6)
     assert message.pressure_uncertainty[0] > 0.009 * message.pressure[0]
     # Planar cubes know the force along x, and the one along y only from their neighbours.
@@ -116,8 +126,12 @@ def test_touch_of_each_scan_is_published():
 
     # A tare changes all values: the touch stays, and no other begins.
     publisher.publish(scan(61, load - 500), 1)
-    assert list(topic.heard[-1].cube) == [5]
+    assert list(topic.heard[-1].cube) == [5] and topic.heard[-1].id == message.id
     assert topic.heard[-1].pressure[0] == pytest.approx(message.pressure[0], rel=1e-4)
     topic.subscribers = 0
     publisher.publish(scan(62, load - 500), 1)
     assert len(topic.heard) == 62
+    # A later subscriber starts the detection again: what touches then is not found.
+    topic.subscribers = 1
+    publisher.publish(concatenate([scan(5000 + number, load) for number in range(30)]), 1)
+    assert len(topic.heard) == 92 and not any(message.cube for message in topic.heard[62:])

@@ -26,7 +26,15 @@ from cube_tensor_driver.mechanics.layer import Layer
 from cube_tensor_driver.mechanics.load_response import LoadResponse
 from cube_tensor_driver.mechanics.measurement_model import CubeMeasurement
 from cube_tensor_driver.touch.pad_noise import GAIN_ERROR, compute_noise_of_all_pads
-from cube_tensor_driver.touch.touch_detection import MAX_DRIFT, OVERSHOOT, REFERENCE, Touch
+from cube_tensor_driver.touch.touch_detection import (
+    MAX_DRIFT,
+    NO_TOUCH,
+    OVERSHOOT,
+    REFERENCE,
+    Touch,
+)
+from cube_tensor_driver.touch.touch_links import TouchLinks
+from cube_tensor_driver.touch.tracker.contact_tracker import TrackedContact
 
 DEPTH = 5e-3
 """Depth of the cubes' centres below the surface, in m."""
@@ -188,6 +196,56 @@ def test_what_was_there_at_the_start_is_no_touch_and_hides_none_after_it_went(ma
     assert not any(len(found.cube) for found in [*run.feed(300, load), *run.feed(60)])
     (found,) = run.feed(1, run.ball((0.0, 0.0, -0.02), (0.0, 0.0)))
     assert len(found.cube) == 1
+
+
+def test_a_touch_keeps_its_number_while_it_moves_and_splits(make_skin):
+    """Two balls begin, one moves over five cubes, goes away from a third that came with it, and
+    ends. A number is the time of the first scan."""
+    run = Run(make_skin(8, known=True))
+    still = run.ball((0.0, 0.0, -0.5), (-28e-3, -28e-3))
+    run.feed(100)
+    begin_ns = START_NS + (run.scans + 1) * 10**9 // RATE
+    links, linked = TouchLinks(run.skin.poses), []
+    path = [-20e-3 + 40e-3 * number / 80 for number in range(81)]
+    seen = []
+    third = run.ball((0.0, 0.0, -0.7), (0.0, 12e-3))
+    for number, x in enumerate(path):
+        place = np.array([x, 12e-3])
+        load = still + run.ball((0.2, 0.0, -1.0), place)
+        if number > 40:  # another one stays behind in the middle
+            load = load + third
+        (found,) = run.feed(1, load)
+        seen.append(dict(zip(found.id.tolist(), found.cube.tolist(), strict=True)))
+        centres = [(-28e-3, -28e-3), place] + ([(0.0, 12e-3)] if number > 60 else [])
+        contacts = [contact_at(k, centre) for k, centre in enumerate(centres)]
+        linked.append(links.link(contacts, found).tolist())
+    moving, other = begin_ns, begin_ns + 1
+    assert all(seen[number].keys() == {moving, other} for number in range(41))
+    x, y = run.skin.poses.position[:, 0], run.skin.poses.position[:, 1]
+    assert [abs(x[one[moving]] - path[k]) < 8e-3 for k, one in enumerate(seen)].count(False) == 0
+    assert {one[other] for one in seen} == {int(np.hypot(x + 28e-3, y + 28e-3).argmin())}
+    (late,) = seen[-1].keys() - {moving, other}
+    since = [number for number, one in enumerate(seen) if late in one]
+    assert since == list(range(since[0], 81)) and late == START_NS + (101 + since[0]) * 10**6
+    # Contacts name the touch at their place, that of a touch that splits the new one.
+    assert [one[:2] for one in linked] == [[other, moving]] * 81
+    assert linked[-1] == [other, moving, late] and linked[61][2] in (moving, late)
+
+    # A contact keeps the number of a touch that has ended.
+    ended = run.feed(40, still)[-1]
+    assert ended.id.tolist() == [other]
+    assert links.link([contact_at(1, (20e-3, 12e-3))], ended).tolist() == [moving]
+    assert links.link([contact_at(9, (20e-3, 12e-3))], ended).tolist() == [NO_TOUCH]
+    (again,) = run.feed(1, still + run.ball((0.0, 0.0, -1.0), (20e-3, 12e-3)))
+    assert again.id.tolist() == [again.stamp_ns, other]
+    assert links.link([contact_at(9, (20e-3, 12e-3))], again).tolist() == [again.stamp_ns]
+
+
+def contact_at(number: int, centre) -> TrackedContact:
+    """Return a contact of 6 mm width."""
+    values = dict.fromkeys(TrackedContact._fields, 0.0)
+    values |= {"id": number, "position": np.array([*centre, DEPTH]), "area": np.pi * 3e-3**2}
+    return TrackedContact(**values)
 
 
 def test_several_scans_in_one_call_give_the_same(make_skin):

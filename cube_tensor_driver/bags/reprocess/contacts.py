@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Contacts and surface traction, computed and written while a bag is reprocessed."""
+"""Touches, contacts and surface traction, computed and written while a bag is reprocessed."""
 
 from __future__ import annotations
 
@@ -19,10 +19,13 @@ from ...messages.skin_info import (
     read_cube_poses,
     read_skin_elastomer,
 )
-from ...messages.types import CONTACTS, TRACTION
+from ...messages.touch import make_touch_message
+from ...messages.types import CONTACTS, TOUCH, TRACTION
 from ...touch.contact_finder import ContactFinder, ContactSettings, contact_finder
+from ...touch.touch_detection import NO_TOUCHES, Touch, Touches
 from ..metadata import quality
 from ..read import make_message, serialise
+from ..recording import make_recorded_skin
 from ..write import BagWriter
 
 if TYPE_CHECKING:
@@ -43,10 +46,10 @@ class ContactOptions:
 
 
 class ContactWriter:
-    """Computes the contacts of one skin from its stress and writes them into a bag.
+    """Computes touches and contacts of one skin from its stress and writes them into a bag.
 
-    The topics `contacts` and `traction` (force per area on the surface) have the same messages as
-    those that the ROS node `contacts` publishes.
+    The topics `touch`, `contacts` and `traction` (force per area on the surface) have the same
+    messages as those that the ROS nodes publish.
     """
 
     def __init__(
@@ -55,7 +58,7 @@ class ContactWriter:
         topics: str,
         options: ContactOptions,
     ) -> None:
-        """Add the topics of contacts and traction to a bag.
+        """Add the topics of touches, contacts and traction to a bag.
 
         Args:
             writer: The bag that is being written.
@@ -67,12 +70,15 @@ class ContactWriter:
         self._period_ns = 1e9 / options.rate
         self._contacts = f"{topics}contacts"
         self._traction = f"{topics}traction"
+        self._touches = f"{topics}touch"
+        writer.add_topic(self._touches, TOUCH, [quality()])
         writer.add_topic(self._contacts, CONTACTS, [quality()])
         writer.add_topic(
             self._traction,
             TRACTION,
             [quality(depth=2)],
         )
+        self._info: SkinInfo | None = None
         self._geometry: list[object] | None = None
         self._finder: ContactFinder | None = None
         self._frame_id = ""
@@ -89,11 +95,18 @@ class ContactWriter:
             CubeError: Contacts cannot be computed on a skin with these cubes.
         """
         if self._geometry == geometry(info):
+            # A tare, or drift that is tracked, changes all values.
+            if info is not self._info:
+                self._touch.restart()
+            self._info = info
             return
+        calibrations = read_cube_calibrations(info)
+        self._touch: Touch = Touch(make_recorded_skin(info, calibrations))
+        self._info = info
         self._finder = contact_finder(
             self._settings,
             read_cube_poses(info),
-            read_cube_calibrations(info),
+            calibrations,
             read_skin_elastomer(info),
         )
         self._latest = LatestStress(len(info.cubes))
@@ -106,9 +119,9 @@ class ContactWriter:
         messages: Decoded[FrequencyRows],
         recorded_ns: Times,
     ) -> None:
-        """Compute contacts from the stress of M messages and write them into the bag.
+        """Compute touches and contacts from the stress of M messages and write them into the bag.
 
-        The message of contacts gets the recording time of the message from which it was computed.
+        They get the recording time of the message from which they were computed.
 
         Args:
             stress: Rows of stress of all M messages, message after message.
@@ -120,7 +133,13 @@ class ContactWriter:
             begin = number * rows_per_message
             rows = stress.select(slice(begin, begin + rows_per_message))
             self._latest.update(rows, stamp_ns * 1e-9)
-            self._write(stamp_ns, int(recorded_ns[number]))
+            time_ns = int(recorded_ns[number])
+            touches = self._touch(rows)
+            for found in touches:
+                message = make_touch_message(make_message, self._frame_id, found)
+                self._writer.write(self._touches, time_ns, serialise(message))
+            newest = touches[-1] if touches else NO_TOUCHES
+            self._write(stamp_ns, time_ns, newest)
 
     def _is_due(self, stamp_ns: int) -> bool:
         """Return whether contacts are due: a period after the last due time, or after a jump back.
@@ -136,7 +155,7 @@ class ContactWriter:
         self._last_ns = stamp_ns
         return True
 
-    def _write(self, stamp_ns: int, recorded_ns: int) -> None:
+    def _write(self, stamp_ns: int, recorded_ns: int, touches: Touches) -> None:
         """Write the contacts and traction of the newest stress of each cube, if they are due.
 
         Between two due times, only the contacts are written, and only when one begins to slip.
@@ -144,6 +163,7 @@ class ContactWriter:
         Args:
             stamp_ns: Stamp of the messages, in ns since the Unix epoch.
             recorded_ns: Time of recording of the messages, in ns since the Unix epoch.
+            touches: Touches in the newest scan.
         """
         if self._finder is None:
             raise BagError(f"{self._contacts}: no info says where the cubes are; record info")
@@ -159,6 +179,7 @@ class ContactWriter:
                 values,
                 self._latest.left_out,
                 self._latest.status,
+                touches,
             )
         elif not begins_to_slip:
             return
@@ -168,6 +189,7 @@ class ContactWriter:
             self._frame_id,
             finder.contacts,
             finder.slip,
+            finder.touch_id,
         )
         self._writer.write(self._contacts, recorded_ns, serialise(CONTACTS, message))
         cloud = finder.cloud(values) if is_due else None

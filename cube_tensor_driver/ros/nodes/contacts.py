@@ -9,19 +9,23 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields
 from functools import partial
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.publisher import Publisher
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 
 from ...config.parameters import CONTACTS
 from ...core.arrays import Index
 from ...messages.contacts import make_contacts_message, make_traction_message
 from ...messages.skin_info import read_cube_calibrations, read_skin_elastomer
-from ...msg import SkinContacts
+from ...msg import SkinContacts, SkinTouch
 from ...touch.contact_finder import ContactFinder, ContactSettings, contact_finder
+from ...touch.touch_detection import NO_TOUCHES, Touches
 from ..diagnostics.updater import Diagnostics, make_status
 from ..messages import make_message
 from ..node import run
+from ..qos import NEWEST
 from ..skin_subscriber import FollowedSkin, SkinSubscriberNode
 
 RETRY_PERIOD_S = 5.0
@@ -37,6 +41,7 @@ class Contacts(SkinSubscriberNode):
     per area on the surface of the skin, and checks at each message of `stress` whether a contact
     begins to slip. If so, it publishes the last contacts again at once with their new states of
     slip, because a hand that loses an object must react before the next regular message.
+    `touch` gives the ids of the touches that the contacts belong to.
 
     The `ContactFinder` is set up in another thread, because that may take long on a large skin and
     the node must answer requests meanwhile. Nothing is published before it is ready.
@@ -48,10 +53,14 @@ class Contacts(SkinSubscriberNode):
         self._finder: ContactFinder | None = None
         self._future_finder: Future[ContactFinder] | None = None
         self._problem = ""
+        self._touch = b""
         self._updater = Diagnostics(self, self._statuses)
 
     def configure(self) -> None:
         self._traction = self.own(self.create_lifecycle_publisher(PointCloud2, "traction", 2))
+        self._touch = b""
+        touch = self.create_subscription(SkinTouch, "touch", self._on_touch, NEWEST, raw=True)
+        self.own(touch)
         super().configure()
 
     def has_listeners(self, publisher: Publisher) -> bool:
@@ -90,6 +99,7 @@ class Contacts(SkinSubscriberNode):
             values,
             newest.left_out,
             newest.status,
+            self._read_touches(),
         )
         # Computing the point cloud takes time, so it is done only while somebody subscribes.
         if self._has_traction_listeners():
@@ -128,7 +138,19 @@ class Contacts(SkinSubscriberNode):
             frame_id,
             finder.contacts,
             finder.slip,
+            finder.touch_id,
         )
+
+    def _on_touch(self, data: bytes) -> None:
+        # Most messages are replaced by newer ones before they are used, so none is decoded here.
+        self._touch = data
+
+    def _read_touches(self) -> Touches:
+        """Return the newest touches: their cubes and ids."""
+        if not self._touch:
+            return NO_TOUCHES
+        message = deserialize_message(self._touch, SkinTouch)
+        return NO_TOUCHES._replace(cube=np.array(message.cube, int), id=np.array(message.id, int))
 
     def _take_finder(self) -> ContactFinder | None:
         """Return the contact finder; None while it is being set up, or if the set-up has failed.

@@ -40,6 +40,7 @@ from ..qos import LATCHED, scans_per_message
 from .state_interfaces import make_state_interfaces
 from .stress_publisher import StressPublisher
 from .taring import Taring, tare_folder
+from .touch_publisher import TouchPublisher
 
 if TYPE_CHECKING:
     from ...bags.reprocess.recorded_reconstruction import RecordedReconstruction
@@ -107,10 +108,6 @@ class Reconstruction(CubeNode):
         false_alarms = float(self.value("touch_false_alarms"))
         self._touch = None
         if false_alarms:
-            # The import is here and not at the top, because it loads the contact mechanics, which
-            # takes time and is needed only for the detection of touch.
-            from .touch_publisher import TouchPublisher
-
             self._touch = TouchPublisher(self, skin, profile, false_alarms)
         self._state_interfaces = make_state_interfaces(self, skin)
         self._info = self.own(self.create_publisher(SkinInfo, "info", LATCHED))

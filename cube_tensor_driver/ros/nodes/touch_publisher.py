@@ -5,19 +5,19 @@
 from __future__ import annotations
 
 import struct
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 
-import numpy as np
 from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
-from std_msgs.msg import Header
 
 from ...config.skin import Skin
 from ...core.rows import StressRows
 from ...messages.codec import SECOND
-from ...messages.types import TOUCH
+from ...messages.touch import make_touch_message
 from ...msg import SkinTouch
-from ...touch.touch_detection import NO_TOUCHES, Touch, Touches
-from ..messages import make_message, to_time
+from ...touch.touch_detection import NO_TOUCHES, Touch
+from ..messages import make_message
 from ..node import CubeNode
 
 STAMP = struct.Struct("<iI")
@@ -32,7 +32,9 @@ message state its encoding (CDR encapsulation header)."""
 class TouchPublisher:
     """Finds touches in the stress of a skin, and publishes one message on `touch` for each scan.
 
-    A scan is one sample of every cube.
+    A scan is one sample of every cube. Without a subscriber nothing is computed. At the first
+    subscriber, the detection is set up in another thread, because that takes seconds on a large
+    bent skin.
     """
 
     def __init__(
@@ -51,8 +53,10 @@ class TouchPublisher:
             false_alarms: Accepted rate of false alarms of the whole skin, per hour. A false alarm
                 is a touch that is found although there is only noise.
         """
-        self._touch = Touch(skin, false_alarms)
-        self._frame_id = skin.parent_frame
+        self._set_up = partial(Touch, skin, false_alarms)
+        self._worker = ThreadPoolExecutor(1)
+        self._future: Future[Touch] | None = None
+        self._make_message = partial(make_touch_message, make_message, skin.parent_frame)
         self._publisher = node.own(node.create_lifecycle_publisher(SkinTouch, "touch", profile))
         self._rest_changes = 0
         # Most messages contain no touch and differ only in their stamps, so such a message is
@@ -67,14 +71,17 @@ class TouchPublisher:
             rest_changes: Number of times that the rest frequencies (frequencies without load) have
                 changed before these rows. After a change the detection is restarted.
         """
+        if not self._publisher.get_subscription_count():
+            return
+        if self._future is None:
+            self._future = self._worker.submit(self._set_up)
+        if not self._future.done():
+            return
+        touch = self._future.result()
         if rest_changes != self._rest_changes:
             self._rest_changes = rest_changes
-            self._touch.restart()
-        for touches in self._touch(rows):
-            # Without subscribers only publishing is left out. The detection above must go on,
-            # because it compares each scan with earlier ones.
-            if not self._publisher.get_subscription_count():
-                continue
+            touch.restart()
+        for touches in touch(rows):
             if len(touches.cube):
                 self._publisher.publish(self._make_message(touches))
             else:
@@ -86,25 +93,3 @@ class TouchPublisher:
                     nanoseconds,
                 )
                 self._publisher.publish(bytes(self._empty))
-
-    def _make_message(self, touches: Touches) -> SkinTouch:
-        shear_x, shear_y, along_z = touches.force.T
-        shear_x_uncertainty, shear_y_uncertainty, force_uncertainty = touches.force_uncertainty.T
-        columns = {
-            "pressure": touches.pressure,
-            "pressure_uncertainty": touches.pressure_uncertainty,
-            "normal_force": -along_z,
-            "force_uncertainty": force_uncertainty,
-            "shear_x": shear_x,
-            "shear_y": shear_y,
-            "shear_x_uncertainty": shear_x_uncertainty,
-            "shear_y_uncertainty": shear_y_uncertainty,
-        }
-        header = Header(stamp=to_time(touches.stamp_ns), frame_id=self._frame_id)
-        arrays = {name: column.astype(np.float32) for name, column in columns.items()}
-        return make_message(
-            TOUCH,
-            header=header,
-            cube=touches.cube.astype(np.uint16),
-            **arrays,
-        )

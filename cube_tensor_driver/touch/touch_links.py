@@ -1,0 +1,56 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
+"""Finds out which touch (found in every scan) each contact (found less often) belongs to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..core.arrays import Array, Index
+from ..core.poses import CubePoses
+from .touch_detection import NO_TOUCH, Touches
+from .tracker.contact_tracker import TrackedContact
+
+MAX_PITCHES = 2.0
+"""Largest distance, in pitches (distances of neighbouring cubes), from the edge of a contact to the
+cube of its touch. The largest pressure of a wide contact may be far from its centre."""
+
+MIN_CHANGE_PITCHES = 0.5
+"""Smallest difference, in pitches, by which another touch must be nearer to a contact than its
+present one to replace it. A contact between two touches would change between them otherwise."""
+
+
+class TouchLinks:
+    """Links contacts to the touches nearest to them."""
+
+    def __init__(self, poses: CubePoses) -> None:
+        """Start without contacts, on a skin with cubes at these poses."""
+        self._position = poses.position
+        self._pitch = poses.pitch
+        self._linked: dict[int, int] = {}
+
+    def link(self, contacts: Sequence[TrackedContact], touches: Touches) -> Index:
+        """Return the numbers (n,) of the touches of n contacts, `NO_TOUCH` where none was near.
+
+        A contact whose touch has ended keeps its number until another touch is near.
+
+        Args:
+            contacts: The contacts.
+            touches: Touches in the newest scan.
+        """
+        places = self._position[touches.cube]
+        linked = {}
+        for contact in contacts:
+            distance: Array = np.linalg.norm(places - contact.position, axis=1)
+            radius = np.sqrt(contact.area / np.pi)
+            reach = radius + MAX_PITCHES * self._pitch
+            touch = self._linked.get(contact.id, NO_TOUCH)
+            own = distance[touches.id == touch].min(initial=np.inf)
+            limit = min(reach, own - MIN_CHANGE_PITCHES * self._pitch)
+            if distance.min(initial=np.inf) < limit:
+                touch = int(touches.id[distance.argmin()])
+            linked[contact.id] = touch
+        self._linked = linked
+        return np.array(list(linked.values()), np.int64)
