@@ -98,13 +98,13 @@ def test_partial_slip_of_a_ball_is_told_from_a_punch_which_has_none(benches, see
         run = Run(bench, skin.measure(np.array(pads)))
         assert SLIP not in run.states
         found[body.is_ball] = np.array(run.partial)
-    # Shares of the largest shear force of 33 %, 54 % and 74 %.
-    scans = [100, 150, 200]
-    assert found[False][scans] == pytest.approx(0, abs=0.015)
-    early, middle, late = found[True][scans]
-    assert 0.03 < early < 0.1 and 0.06 < middle < 0.17 and 0.09 < late < 0.3
-    assert early < middle < late
-    assert np.isnan(found[True][20])
+    # It is not known at first, and may become unknown where the contact seems to move.
+    assert np.nanmax(found[False]) < 0.02
+    ball = found[True]
+    assert np.isnan(ball[:21]).all() and not np.isnan(ball[100:150]).any()
+    # Shares of the largest shear force of 33 % and 54 %.
+    assert 0.03 < ball[100] < 0.1 and 0.06 < ball[150] < 0.17
+    assert ball[150] - 0.005 < np.nanmax(ball) < 0.3
 
 
 def test_the_noise_of_a_light_contact_is_no_motion_and_does_not_hide_its_slip(benches):

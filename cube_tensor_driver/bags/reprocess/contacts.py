@@ -137,7 +137,7 @@ class ContactWriter:
             touches = self._touch(rows)
             for found in touches:
                 message = make_touch_message(make_message, self._frame_id, found)
-                self._writer.write(self._touches, time_ns, serialise(message))
+                self._writer.write(self._touches, time_ns, serialise(TOUCH, message))
             newest = touches[-1] if touches else NO_TOUCHES
             self._write(stamp_ns, time_ns, newest)
 
