@@ -308,7 +308,7 @@ def show_study(result: LayoutStudy) -> None:
     )
     columns = [(name, float(side)) for name in result.error for side in result.sides]
     heads = [f"{name}\n{1e3 * side:g} mm" for name, side in columns]
-    widths = np.concatenate([result.trusted_widths(name) for name in result.error])
+    widths = np.concatenate([result.find_trusted_widths(name) for name in result.error])
     rows = [
         [component, *map(_format_width, column)]
         for component, column in zip(COMPONENTS, widths.T.tolist(), strict=True)

@@ -35,7 +35,7 @@ _QUESTION = struct.Struct("<IQI")
 time of the middle of the window in µs, and CRC-32 of both."""
 
 
-def edges(
+def find_edges(
     millihertz: NDArray[np.uint32],
     phase: NDArray[np.float64],
 ) -> NDArray[np.void]:
@@ -121,4 +121,4 @@ class Oscillators:
         stress, gradient = self._field_at(middle_us)
         # Boards have no common clock with the pads, so that the first edge comes at any phase.
         millihertz = self.hub.frequency(stress, gradient, middle_us * 1e-6).ravel()
-        return edges(millihertz, self._random.random(len(millihertz)))
+        return find_edges(millihertz, self._random.random(len(millihertz)))

@@ -35,7 +35,7 @@ class FirmwareError(CubeError):
     """The firmware cannot be built or run on this machine; the text names what is missing."""
 
 
-def missing(*programs: str) -> str:
+def find_missing(*programs: str) -> str:
     """Return the command that installs the programs that are missing, empty if none is."""
     packages = " ".join(PACKAGES[name] for name in programs if shutil.which(name) is None)
     return f"apt-get install --no-install-recommends {packages}" if packages else ""
@@ -53,7 +53,7 @@ def need(what: str, *programs: str) -> None:
     """
     absent = [name for name in programs if shutil.which(name) is None]
     if absent:
-        raise FirmwareError(f"{what} needs {', '.join(absent)}: {missing(*absent)}")
+        raise FirmwareError(f"{what} needs {', '.join(absent)}: {find_missing(*absent)}")
 
 
 def build(source: Path, out: Path, target: str) -> str:
@@ -109,7 +109,7 @@ class Emulator:
 
     def __enter__(self) -> Emulator:
         # QEMU gets sockets that listen already, so that nobody else takes the ports in between.
-        with _listening(self._address) as host, _listening(ANY_ADDRESS) as pads:
+        with _open_listener(self._address) as host, _open_listener(ANY_ADDRESS) as pads:
             self.port = "socket://{}:{}".format(*host.getsockname())
             command = [*end_with_parent(), "qemu-system-arm"]
             command += ["-M", MACHINE, "-kernel", str(self._image)]
@@ -151,7 +151,7 @@ class Emulator:
             self._process.stderr.close()
 
 
-def _listening(address: tuple[str, int]) -> socket.socket:
+def _open_listener(address: tuple[str, int]) -> socket.socket:
     """Return a socket that listens; FirmwareError: the address cannot be had."""
     try:
         return socket.create_server(address, backlog=1)

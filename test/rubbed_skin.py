@@ -101,12 +101,14 @@ class RubbedSkin:
 
     def pads(self, body: Body, normal: float, shear: Array, centre: Array) -> Array:
         """Stress (cubes, P) in Pa of each pad under a body."""
-        return self.pads_under(body.point_forces(normal, shear, centre))
+        return self.compute_pads_under(body.point_forces(normal, shear, centre))
 
-    def pads_under(self, load: tuple[Array, Array]) -> Array:
+    def compute_pads_under(self, load: tuple[Array, Array]) -> Array:
         """Stress (cubes, P) in Pa of each pad under point forces."""
         cubes, setting = self.bench.poses.position[:, :2], self.bench.setting
-        return self.bench.pads_in(compute_field_below(cubes, setting.depth, load, setting.poisson))
+        return self.bench.compute_pads_in(
+            compute_field_below(cubes, setting.depth, load, setting.poisson)
+        )
 
     def measure(self, pads: Array) -> Array:
         """Components (scans, cubes, 15) that the pipeline computes from pads (scans, cubes, P)."""

@@ -97,7 +97,7 @@ def run(options: argparse.Namespace) -> int:
     if options.figures is not None:
         reports.draw(result, options.figures)
     if options.output is not None:
-        reports.write(options.output, result, _command(options), model)
+        reports.write(options.output, result, _format_command(options), model)
     return 0
 
 
@@ -129,7 +129,7 @@ def _check_options(options: argparse.Namespace, model: Model) -> None:
         )
 
 
-def _command(options: argparse.Namespace) -> str:
+def _format_command(options: argparse.Namespace) -> str:
     """Return the command line that computes the same result, without options for output files."""
     words = ["./cube", "fem"]
     # Only what changes the result; the default number of meshes is left out.

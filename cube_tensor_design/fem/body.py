@@ -152,7 +152,7 @@ def strip_layout(
     return Layout(layout.name, normals + centre * directions, normals, width)
 
 
-def field_axes(layout: Layout) -> tuple[int, ...]:
+def choose_field_axes(layout: Layout) -> tuple[int, ...]:
     """Return the axes in which a layout is computed: 0 and 2 (x and z) for a layout in a plane, all
     three for one in space."""
     return (0, 2) if layout.planar else (0, 1, 2)
@@ -196,7 +196,7 @@ def make_mesh(
     Raises:
         ElasticError: Edges of pads are too close to each other.
     """
-    axes = list(field_axes(layout))
+    axes = list(choose_field_axes(layout))
     stops = _pad_edges(layout)
     _check_edges(stops, body.side / 2)
 
@@ -230,7 +230,7 @@ def _pad_edges(layout: Layout) -> Array:
     half = layout.pad_size / 2
     edges = []
     for position, normal in zip(layout.positions, layout.normals, strict=True):
-        for axis in field_axes(layout):
+        for axis in choose_field_axes(layout):
             if normal[axis] == 0:
                 edges += [
                     abs(position[axis] - half),

@@ -33,11 +33,11 @@ from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.core.response import project
 from cube_tensor_driver.core.symmetry import (
     Structure,
-    default_modes,
+    choose_default_modes,
     find_structure,
 )
 
-from .body import Body, check_pads, field_axes, make_mesh
+from .body import Body, check_pads, choose_field_axes, make_mesh
 from .memory import check_memory
 from .solid import Parity, Solid, lame
 
@@ -319,8 +319,8 @@ def load_modes(solid: Solid, layout: Layout) -> Load:
     The stresses of the pads under a unit amplitude of each mode are the columns of the response
     matrix.
     """
-    axes = field_axes(layout)
-    modes = default_modes(layout)
+    axes = choose_field_axes(layout)
+    modes = choose_default_modes(layout)
     numbers = range(modes.n_modes)
     stress = modes.stress[np.ix_(numbers, axes, axes)]
     gradient = modes.gradient[np.ix_(numbers, axes, axes, axes)]
@@ -332,8 +332,9 @@ def load_modes(solid: Solid, layout: Layout) -> Load:
 
 
 def load_outside(solid: Solid, field: Callable[[Array], Array]) -> Load:
-    """Return the tractions of a field on the outer faces of a body; see `Solid.outer_forces`."""
-    return lambda parity: [solid.outer_forces(parity, field)]
+    """Return the tractions of a field on the outer faces of a body, see
+    `Solid.compute_outer_forces`."""
+    return lambda parity: [solid.compute_outer_forces(parity, field)]
 
 
 def pad_stresses(
@@ -351,7 +352,7 @@ def pad_stresses(
         report: Called as report(what) before every solve.
     """
     stresses: Any = 0.0
-    for parity in each_parity(solid, report):
+    for parity in iterate_parities(solid, report):
         in_body, *in_cube = load(parity)
         forces = sum(in_cube, in_body)
         part = np.zeros((layout.n_pads, forces.shape[1]))
@@ -369,7 +370,7 @@ def pad_stresses(
     return stresses
 
 
-def each_parity(
+def iterate_parities(
     solid: Solid,
     report: Callable[[str], None] = lambda _: None,
 ) -> Iterator[Parity]:
@@ -377,7 +378,7 @@ def each_parity(
     stiffness matrix follow one another."""
 
     def shared(parity: Parity) -> Parity:
-        return solid.with_sorted_axes(parity)[0]
+        return solid.sort_axes(parity)[0]
 
     for parity in sorted(solid.parities, key=shared, reverse=True):
         report("parity " + "".join("-0+"[sign + 1] for sign in parity))

@@ -22,7 +22,7 @@ MAX_WAVENUMBER = 30.0
 wave has decayed by exp(-30) at this depth."""
 
 
-def line_load(
+def compute_line_load(
     layer: Layer,
     x: Array,
     depth: float,

@@ -30,7 +30,7 @@ def check_memory(grid: skfem.Mesh, bytes_per_corner: float | None = None) -> Non
     """
     per_corner = bytes_per_corner or BYTES_PER_CORNER[int(grid.dim())]
     needed = FIXED_BYTES + grid.nvertices * per_corner
-    available = available_memory()
+    available = find_available_memory()
     if needed > available:
         raise ElasticError(
             f"this needs about {needed / 1e9:.2g} GB of memory and "
@@ -39,7 +39,7 @@ def check_memory(grid: skfem.Mesh, bytes_per_corner: float | None = None) -> Non
         )
 
 
-def available_memory() -> float:
+def find_available_memory() -> float:
     """Return the bytes that this process may still take, limited by the machine and by ulimit."""
     free = float(psutil.virtual_memory().available)
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)

@@ -182,7 +182,7 @@ def mesh_box(
     to_last_pad = _split(inner, inner[-1], size)
     face = np.concatenate([to_last_pad, to_edge[1:]])
 
-    def half_line(end: float) -> Array:
+    def make_half_line(end: float) -> Array:
         decay_end = min(end - 1.0, DECAY_DISTANCE)
         near = 1.0 + _grade_nodes(decay_end, smallest, growth)
         # The first brick far away continues from the last one that is near.
@@ -192,9 +192,9 @@ def mesh_box(
 
     lines = []
     for below, above in zip(lower, upper, strict=True):
-        line = half_line(above)
+        line = make_half_line(above)
         if below > 0:
-            negative = -half_line(below)[:0:-1]
+            negative = -make_half_line(below)[:0:-1]
             line = np.concatenate([negative, line])
         lines.append(line)
     return skfem.MeshHex.init_tensor(*lines)

@@ -38,7 +38,7 @@ from cube_tensor_driver.core.errors import (
 )
 from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.core.symmetry import (
-    default_modes,
+    choose_default_modes,
     find_largest_symmetry,
     find_structure,
 )
@@ -156,7 +156,7 @@ def _build_model(data: Mapping[str, Any], folder: Path) -> Model:
     neglect = tuple(data.get("neglect", ()))
     # Both calls raise an error for a name that does not fit the layout, before any work.
     find_structure(layout, symmetry)
-    default_modes(layout).index(neglect)
+    choose_default_modes(layout).index(neglect)
     calibration = find_shipped_calibration(layout)
     if "calibration" in data:
         calibration = read_calibration(find_calibration(data["calibration"], folder))

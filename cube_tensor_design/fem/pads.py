@@ -28,7 +28,7 @@ import numpy as np
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.layout import Layout
 
-from .body import field_axes
+from .body import choose_field_axes
 
 SAME_COORDINATE = 1e-13
 """Distance, in d0 (half the side of the cube), below which two coordinates of nodes are equal.
@@ -58,7 +58,7 @@ def pad_weights(
         rotation: Rotation matrix (dim, dim) of the cube in a deformed body; None: the cube has not
             rotated.
     """
-    axes = list(field_axes(layout))
+    axes = list(choose_field_axes(layout))
     dim, n_dofs = positions.shape
     half = layout.pad_size / 2
     component = np.arange(n_dofs) % dim
@@ -89,13 +89,13 @@ def pad_weights(
                 stop = min(centre[k] + half, 1.0)
                 rounded = np.round(positions[k, dofs], 14)
                 nodes, index = np.unique(rounded, return_inverse=True)
-                integral = interval_weights(nodes, order, parity[k], start, stop)
+                integral = compute_interval_weights(nodes, order, parity[k], start, stop)
                 product *= integral[index] / (stop - start)
             weights[pad, dofs] = product
     return weights
 
 
-def interval_weights(
+def compute_interval_weights(
     nodes: Array,
     order: int,
     parity: int,
@@ -116,7 +116,7 @@ def interval_weights(
     if parity:
         # The whole face has the same tractions as its half and their mirror images.
         whole = np.concatenate([-nodes[:0:-1], nodes])
-        weights = interval_weights(whole, order, 0, start, stop)
+        weights = compute_interval_weights(whole, order, 0, start, stop)
         centre = len(nodes) - 1
         return weights[centre:] + parity * weights[centre::-1]
 
@@ -138,8 +138,8 @@ def interval_weights(
     # The corner has no trial function of its own. The polynomials of the element beside it continue
     # up to the corner.
     trial = np.eye(n)[:, 1:-1]
-    trial[-1, -order:] = _continuation(order)
-    trial[0, :order] = _continuation(order)[::-1]
+    trial[-1, -order:] = _continue_polynomials(order)
+    trial[0, :order] = _continue_polynomials(order)[::-1]
     matrix = mass @ trial
     right = trial.T @ integral
     weights = np.zeros(n)
@@ -162,7 +162,7 @@ def _make_line_element(order: int) -> tuple[Array, Array]:
     return weighted.T @ phi, weight @ phi
 
 
-def _continuation(order: int) -> Array:
+def _continue_polynomials(order: int) -> Array:
     """Return the values (order,) at the end 1 of an element [0, 1] of the polynomials that are 1 at
     one of its other nodes and 0 at the rest: binomial coefficients of alternating sign."""
     values = []

@@ -25,7 +25,7 @@ from cube_tensor_driver.mechanics.influence import Influence
 from cube_tensor_driver.mechanics.layer import Layer
 
 from .body import Body, check_pads, make_mesh
-from .fem import each_parity, make_solid
+from .fem import iterate_parities, make_solid
 from .memory import check_memory
 from .solid import Solid, mirror_images
 
@@ -77,7 +77,7 @@ def _compute_surface_influence(solid: Solid, layout: Layout) -> tuple[Array, Arr
     dofs = dim * nodes[:, None] + np.arange(dim)
 
     total: Array | float = 0.0
-    for parity in each_parity(solid):
+    for parity in iterate_parities(solid):
         # One solve has the weights of all pads as its right-hand sides.
         gaps = solid.pad_weights(layout, parity).T
         displacement = solid.solve(parity, solid.body @ gaps)

@@ -180,12 +180,12 @@ class Solid:
         self._axis_kind = [coordinates.index(line) for line in coordinates]
         self._last_solve: _Factors | None = None
 
-        self.body = stiffness(self.scalar_elements(in_cube=False), body)
+        self.body = stiffness(self.select_elements(in_cube=False), body)
         self.total = self.body
         if cube is not None:
-            self.total = self.body + stiffness(self.scalar_elements(in_cube=True), cube)
+            self.total = self.body + stiffness(self.select_elements(in_cube=True), cube)
 
-    def outer_forces(self, parity: Parity, field: Callable[[Array], Array]) -> Array:
+    def compute_outer_forces(self, parity: Parity, field: Callable[[Array], Array]) -> Array:
         """Return the nodal forces (dofs, n) of n fields that act as tractions on the outer faces.
 
         Args:
@@ -220,7 +220,7 @@ class Solid:
 
     def solve(self, parity: Parity, forces: Array) -> Array:
         """Return the displacements (dofs, n) under nodal forces (dofs, n) of one parity."""
-        sorted_parity, swap = self.with_sorted_axes(parity)
+        sorted_parity, swap = self.sort_axes(parity)
         if self._last_solve is None or self._last_solve.parity != sorted_parity:
             self._last_solve = None  # frees its memory before the next factorisation
             self._last_solve = self._factorise(sorted_parity)
@@ -231,12 +231,12 @@ class Solid:
         return u
 
     def _factorise(self, parity: Parity) -> _Factors:
-        free = np.flatnonzero(~self._held(parity))
+        free = np.flatnonzero(~self._find_held(parity))
         ordering = "MMD_AT_PLUS_A"
         if self.dim == 3:
             # Five times faster, and half the memory, of SuperLU's own ordering.
             nodes = free // self.dim
-            order = nested_dissection(self._grid[:, nodes])
+            order = order_by_nested_dissection(self._grid[:, nodes])
             free = free[order]
             ordering = "NATURAL"
         matrix = self.total[free][:, free].tocsc()
@@ -250,7 +250,7 @@ class Solid:
         )
         return _Factors(parity, free, factors)
 
-    def with_sorted_axes(self, parity: Parity) -> tuple[Parity, Index]:
+    def sort_axes(self, parity: Parity) -> tuple[Parity, Index]:
         """Exchange axes along which the grid is the same, so that their parities are in order.
 
         Parities that are the same after the exchange share one factorisation of the stiffness.
@@ -278,7 +278,7 @@ class Solid:
         sorted_parity = tuple(parity[k] for k in axes)
         return sorted_parity, swap.ravel()
 
-    def scalar_elements(self, in_cube: bool) -> skfem.Basis:
+    def select_elements(self, in_cube: bool) -> skfem.Basis:
         """Return the scalar elements (of one displacement component) in the cube, or in the
         elastomer around it."""
         mesh = self.basis.mesh
@@ -294,7 +294,7 @@ class Solid:
         """
         return -pad_weights(self.positions, self.order, layout, parity)
 
-    def _held(self, parity: Parity) -> Mask:
+    def _find_held(self, parity: Parity) -> Mask:
         """Return which unknowns (dofs,) are held at zero.
 
         Mirrors, the ground and a rigid cube hold some; others are held to stop rigid motions. A
@@ -375,7 +375,7 @@ def mirror_images(parity: Parity) -> tuple[Array, Array]:
     return images, weights
 
 
-def nested_dissection(grid: Index) -> Index:
+def order_by_nested_dissection(grid: Index) -> Index:
     """Return an elimination order (n,) of nodes of a product grid of quadratic elements.
 
     Both halves of the grid come first, each in such an order, then the cut between them.

@@ -36,7 +36,7 @@ from numpy.polynomial.legendre import legvander
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.layout import Layout
 
-from .body import Body, field_axes
+from .body import Body, choose_field_axes
 from .fem import Load, Progress, solve_meshes
 from .solid import Parity, Solid, mirror_images
 
@@ -117,7 +117,7 @@ def compute_thermal_stress(
     def load(solid: Solid) -> Load:
         parts = []
         for number, (lam, mu) in enumerate(solid.moduli):
-            basis = solid.scalar_elements(in_cube=number == 1)
+            basis = solid.select_elements(in_cube=number == 1)
             x = np.asarray(basis.default_parameters()["x"])
             heights = (x[-1] + z) / half_height
             profiles = legvander(heights, N_PROFILES - 1)
@@ -161,26 +161,26 @@ def compute_weight(
     """
     # In a skin of equal cells it does not matter where the cells are cut along x.
     body = replace(body, ground=True, confined=True, x=0.0)
-    axes = field_axes(layout)
+    axes = choose_field_axes(layout)
     densities = body.density, body.cube_density
 
     def load(solid: Solid) -> Load:
         parts = []
         for number, density in enumerate(densities):
-            elements = solid.scalar_elements(in_cube=number == 1)
+            elements = solid.select_elements(in_cube=number == 1)
             volume = skfem.LinearForm(lambda w, _: w).assemble(elements)
             # A force along one axis acts on this component of each node.
             by_component = np.kron(volume[:, None], np.eye(solid.dim))
             parts.append(-density * by_component)
 
-        def of_parity(parity: Parity) -> Sequence[Array]:
+        def select_parity(parity: Parity) -> Sequence[Array]:
             images, weights = mirror_images(parity)
             # A uniform force along an axis is odd under the mirror of that axis, and even under the
             # others. So `has_parity` is 1 for the axes along which forces have this parity, else 0.
             has_parity = weights @ images
             return [part * has_parity for part in parts]
 
-        return of_parity
+        return select_parity
 
     results = solve_meshes(body, layout, meshes, load, progress)
     pads = np.zeros((layout.n_pads, 3))

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from cube_tensor_driver.core.modes import PLANE
 from cube_tensor_driver.views.figures.style import print_style, symbol
 
-from ..paper.experiments import ON_LOWER, Experiment, foam_frequency
+from ..paper.experiments import ON_LOWER, Experiment, compute_foam_frequency
 from ..paper.rod_parts import RodParts
 from ..paper.rod_shear import RodShear
 from .curves import add_legend_below, draw_curves
@@ -62,7 +62,7 @@ def draw_experiment(result: Experiment, law: str) -> Figure:
     figure = Figure(figsize=(13, 3.3))
     pads, signals, stress, gradient = figure.subplots(1, 4)
     x = result.displacement
-    frequency = foam_frequency(result.pads)[:, ON_LOWER]
+    frequency = compute_foam_frequency(result.pads)[:, ON_LOWER]
     draw_curves(pads, x, dict(zip(PAD_LABELS, frequency.T, strict=True)))
     pads.set(title="frequencies", ylabel="frequency / kHz")
     by_label = dict(zip(SIGNAL_LABELS, result.prototype.T, strict=True))

@@ -38,7 +38,7 @@ def draw_methods(example: FieldExample, prefix: str = "") -> Figure:
     truth = example.pressure["truth"]
     maps = {}
     for name, pressure in example.pressure.items():
-        share = relative_rms(pressure - truth, truth)
+        share = compute_relative_rms(pressure - truth, truth)
         title = f"{prefix}{name}\nrms error {100 * share:.0f} %"
         maps[name if name == "truth" else title] = pressure
     image = _draw_maps(axes[0], example, maps)
@@ -60,15 +60,15 @@ def draw_traction(example: FieldExample) -> Figure:
 
     maps = {"truth": truth}
     for name in METHODS:
-        share = relative_rms(example.pressure[name] - truth, truth)
+        share = compute_relative_rms(example.pressure[name] - truth, truth)
         maps[f"{name}: {100 * share:.1f} %"] = example.pressure[name]
     image = _draw_maps(axes.flat[:4], example, maps)
     figure.colorbar(image, ax=axes[0], label=PRESSURE_LABEL)
 
     error = np.abs(example.pressure[METHODS[-1]] - truth)
     errors = {
-        f"its error: {100 * relative_rms(error, truth):.1f} %": error,
-        f"predicted: {100 * relative_rms(predicted, truth):.1f} %": predicted,
+        f"its error: {100 * compute_relative_rms(error, truth):.1f} %": error,
+        f"predicted: {100 * compute_relative_rms(predicted, truth):.1f} %": predicted,
     }
     image = _draw_maps(axes.flat[4:], example, errors)
     # A colour bar of the whole row keeps the columns of both rows aligned.
@@ -76,7 +76,7 @@ def draw_traction(example: FieldExample) -> Figure:
     return figure
 
 
-def relative_rms(values: Array, reference: Array) -> float:
+def compute_relative_rms(values: Array, reference: Array) -> float:
     """Return the rms of values over the rms of a reference."""
     return float(np.linalg.norm(values) / np.linalg.norm(reference))
 

@@ -106,7 +106,7 @@ def experiments(
     found = []
     for name, (displacement, steps) in protocols.items():
         with_cube, without = (bench.run(steps, partial(report, name)) for bench in benches)
-        frequency = foam_frequency(with_cube.pads)
+        frequency = compute_foam_frequency(with_cube.pads)
         experiment = Experiment(
             name=name,
             displacement=displacement,
@@ -127,12 +127,12 @@ def experiments(
 
 
 def _press_and_shear(body: Body, bonded: bool) -> list[LoadStep]:
-    pressing = [plates(body, depth, bonded=bonded) for depth in DISPLACEMENTS]
-    return pressing + [plates(body, 3e-3, x, gripped=not bonded) for x in DISPLACEMENTS]
+    pressing = [make_plate_step(body, depth, bonded=bonded) for depth in DISPLACEMENTS]
+    return pressing + [make_plate_step(body, 3e-3, x, gripped=not bonded) for x in DISPLACEMENTS]
 
 
 def _press_rod(body: Body, bonded: bool) -> list[LoadStep]:
-    return [dent(body, Rod(depth, body.side / 4), bonded) for depth in DISPLACEMENTS]
+    return [make_dent_step(body, Rod(depth, body.side / 4), bonded) for depth in DISPLACEMENTS]
 
 
 def _take_first_half(experiment: Experiment, name: str) -> Experiment:
@@ -143,7 +143,7 @@ def _take_first_half(experiment: Experiment, name: str) -> Experiment:
     return Experiment(**columns | {"name": name})
 
 
-def foam_frequency(pads: Array) -> Array:
+def compute_foam_frequency(pads: Array) -> Array:
     """Return the frequencies in Hz of pads under a stress in Pa, by the pad law."""
     rest, beta, modulus = np.array([REST_FREQUENCY, BETA, FOAM_MODULUS])
     return pad_frequency(pads, rest, beta, modulus)
@@ -163,7 +163,7 @@ def prototype(frequency: Array) -> Array:
     )
 
 
-def plates(
+def make_plate_step(
     body: Body,
     pressed: float,
     sheared: float = 0.0,
@@ -200,33 +200,33 @@ def plates(
     return LoadStep(prescribed, rod, gripped, sliding=not bonded)
 
 
-def dent(
+def make_dent_step(
     body: Body,
     rod: Rod,
     bonded: bool = True,
 ) -> LoadStep:
     """Press a rod into the top, with the bottom bonded to its plate or sliding on it."""
-    return plates(body, 0.0, bonded=bonded, rod=rod)
+    return make_plate_step(body, 0.0, bonded=bonded, rod=rod)
 
 
 def figure_4() -> dict[str, Deformation]:
     """Return the deformations of the paper's section 3: under shear only (key "zx"), and under a
     normal stress that grows along x (key "zz_x")."""
-    return _deformations(VirtualBench(Body(), size=0.2), ("zx", "zz_x"))
+    return _compute_deformations(VirtualBench(Body(), size=0.2), ("zx", "zz_x"))
 
 
 def compute_mode_deformations(body: Body, layout: Layout) -> dict[str, Deformation]:
     """Return the section deformed by `MODE_AMPLITUDE` of each plane mode (linear stress field), by
     the mode's name."""
-    return _deformations(VirtualBench(body, layout=layout, size=0.3), PLANE.names)
+    return _compute_deformations(VirtualBench(body, layout=layout, size=0.3), PLANE.names)
 
 
-def _deformations(bench: VirtualBench, names: Iterable[str]) -> dict[str, Deformation]:
+def _compute_deformations(bench: VirtualBench, names: Iterable[str]) -> dict[str, Deformation]:
     axes = (0, 2)
     deformations = {}
     for name in names:
         mode = PLANE.names.index(name)
         stress = PLANE.stress[mode][np.ix_(axes, axes)]
         gradient = PLANE.gradient[mode][np.ix_(axes, axes, axes)]
-        deformations[name] = bench.loaded(MODE_AMPLITUDE * stress, MODE_AMPLITUDE * gradient)
+        deformations[name] = bench.solve_field(MODE_AMPLITUDE * stress, MODE_AMPLITUDE * gradient)
     return deformations

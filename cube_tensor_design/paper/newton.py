@@ -10,7 +10,7 @@ Source: J. Nocedal, S. J. Wright, Numerical Optimization (2006), 3.1 and 18.1.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -47,7 +47,7 @@ def find_balance(
     prescribed: Array,
     rows: Array,
     balance: Callable[[Array], Balance | None],
-    tangents: Callable[[Array], Iterable[sp.csr_matrix]],
+    tangent: Callable[[Array], sp.csr_matrix],
     linear: bool = False,
 ) -> Array | None:
     """Find displacements at which the forces on the free unknowns balance.
@@ -57,8 +57,7 @@ def find_balance(
         prescribed: (dofs,) prescribed displacements; NaN where an unknown is free.
         rows: (k, dofs) weights of k combinations of the unknowns u that are held, rows @ u = 0.
         balance: Returns forces and energy, or None at displacements that are not possible.
-        tangents: Yields the derivative of the forces, then matrices to try where that one gives no
-            descent.
+        tangent: Returns the derivative of the forces by the displacements.
         linear: Whether the problem is linear, so that one step solves it.
 
     Returns:
@@ -72,24 +71,19 @@ def find_balance(
     for _ in range(MAX_ITERATIONS):
         if state is None:
             return None
-        reached = None
-        for matrix in tangents(u):
-            change = search.correction(u, state, matrix, jump)
-            largest_change = np.abs(change).max()
-            largest = np.abs(u).max()
-            is_small = largest_change < TOLERANCE * largest
-            if linear or is_small:
-                return u + change
-            if jump.any():  # Prescribed displacements are taken as a whole.
-                reached = u + change, balance(u + change)
-            else:
-                reached = search.descend(u, state, change)
-            if reached is not None:
-                break
+        change = search.compute_correction(u, state, tangent(u), jump)
+        is_small = np.abs(change).max() < TOLERANCE * np.abs(u).max()
+        if linear or is_small:
+            return u + change
+        if jump.any():  # Prescribed displacements are taken as a whole.
+            u = u + change
+            state = balance(u)
+            jump = np.zeros_like(u)
+            continue
+        reached = search.descend(u, state, change)
         if reached is None:
             return None
         u, state = reached
-        jump = np.zeros_like(u)
     return None
 
 
@@ -107,7 +101,7 @@ class _Search:
         self._rows = rows
         self._balance = balance
 
-    def correction(
+    def compute_correction(
         self,
         u: Array,
         state: Balance,
@@ -143,13 +137,13 @@ class _Search:
         """Return u plus as much of a change as lowers the energy or the forces out of balance, and
         the state there; None if no part of the change does so."""
         slope = float(state.force @ change)
-        unbalanced = self._unbalanced(state.force)
+        unbalanced = self._measure_unbalanced(state.force)
         # Linearised forces are valid near u only, so the step has a largest length.
         size = min(1.0, MAX_CORRECTION / np.abs(change).max())
         for _ in range(MAX_HALVINGS):
             reached = self._balance(u + size * change)
             if reached is not None:
-                lower_force = self._unbalanced(reached.force) < unbalanced
+                lower_force = self._measure_unbalanced(reached.force) < unbalanced
                 allowed = state.energy + ARMIJO * size * slope
                 lower_energy = slope < 0 and reached.energy <= allowed
                 if lower_force or lower_energy:
@@ -157,7 +151,7 @@ class _Search:
             size /= 2
         return None
 
-    def _unbalanced(self, force: Array) -> float:
+    def _measure_unbalanced(self, force: Array) -> float:
         """Return the norm of the forces that neither a prescribed unknown nor a held combination
         bears."""
         held = self._rows[:, self._free]

@@ -22,7 +22,7 @@ import numpy as np
 
 from cube_tensor_driver.core.arrays import Array
 
-from .experiments import Experiment, foam_frequency, prototype
+from .experiments import Experiment, compute_foam_frequency, prototype
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ def normal_fall(experiment: Experiment) -> NormalFall:
     # stress.
     mean_stress = np.cumsum([before, *stress])
     equal_pads = np.tile(mean_stress[:, None], 4)
-    frequencies = foam_frequency(equal_pads)
+    frequencies = compute_foam_frequency(equal_pads)
     signal = prototype(frequencies)[:, 0]
     # The last part leads from four equal pads to the pads as they are.
     end = experiment.prototype[-1, 0]

@@ -129,19 +129,14 @@ class RodContact:
         pressure = self._stiffness * at.p * at.dp
         return _PUSH.assemble(self._facets, pressure=pressure, slope=at.slope)
 
-    def tangent(self, u: Array, curved: bool = True) -> sp.csr_matrix:
-        """Return the derivative of the nodal forces, sparse (dofs, dofs).
-
-        Args:
-            u: (dofs,) displacements.
-            curved: Whether the rod's curvature counts, which can make the tangent indefinite.
-        """
+    def tangent(self, u: Array) -> sp.csr_matrix:
+        """Return the derivative of the nodal forces, sparse (dofs, dofs)."""
         at = self._compute_penetration(u)
         # The pressure is k p dp/dg, with the stiffness k, the penetration p and the gap g. `normal`
         # is its derivative by g; `bending` comes from the change of the rod's slope along x.
         normal = self._stiffness * (at.dp**2 + at.p * at.ddp)
         pressure = self._stiffness * at.p * at.dp
-        bending = -pressure * at.curvature * curved
+        bending = -pressure * at.curvature
         return self._assemble(normal, at.slope, bending)
 
     def secant(self, u: Array, v: Array) -> sp.csr_matrix:

@@ -42,7 +42,7 @@ from cube_tensor_driver.core.layout import LAYOUTS
 from ..fem.body import Body, strip_layout
 from ..fem.fem import Progress, count_steps
 from ..fem.solid import lame
-from .experiments import SHEAR_SIGNS, dent
+from .experiments import SHEAR_SIGNS, make_dent_step
 from .newton import factorise
 from .rod import ROD_DEPTH, Rod
 from .virtual_bench import LoadStep, VirtualBench
@@ -115,7 +115,7 @@ def rod_parts(
         for place in places:
             report(f"{rod} at {1e3 * place:g} mm")
             pressed = Rod(ROD_DEPTH, place, edge_radius=radius)
-            step = dent(bench.body, pressed)
+            step = make_dent_step(bench.body, pressed)
             parts_by_pads = split_signals(bench, step, signals, held)
             rows.append(parts_by_pads)
         by_pads = np.stack(rows, axis=1)  # (pads, places, parts)
@@ -135,17 +135,17 @@ def draw_back(bench: VirtualBench, step: LoadStep) -> LoadStep:
         return replace(step, rod=replace(rod, pressed=depth))
 
     @cache
-    def excess(depth: float) -> float:
+    def compute_excess(depth: float) -> float:
         """Return the relative excess of the rod's force at this depth over that without the
         cube."""
-        _, forces = bench.rod_pressure(step_to(depth))
+        _, forces = bench.compute_rod_pressure(step_to(depth))
         return float(forces.sum() / force - 1)
 
-    _, forces_without_cube = bench.without_cube().rod_pressure(step)
+    _, forces_without_cube = bench.remove_cube().compute_rod_pressure(step)
     force = forces_without_cube.sum()
     # The force is nearly proportional to the depth.
-    guess = rod.pressed / (1 + excess(rod.pressed))
-    depth = newton(excess, rod.pressed, x1=guess, tol=SAME_DEPTH)
+    guess = rod.pressed / (1 + compute_excess(rod.pressed))
+    depth = newton(compute_excess, rod.pressed, x1=guess, tol=SAME_DEPTH)
     return step_to(depth)
 
 
@@ -165,7 +165,7 @@ def split_signals(
     """
     if bench.finite or step.sliding:
         raise ElasticError("fields superpose on a linear bench whose bottom is bonded; take that")
-    empty = bench.without_cube()
+    empty = bench.remove_cube()
     in_cube = bench.in_cube
     with_cube = draw_back(bench, step) if held == "force" else step
     u = bench.solve(with_cube)
@@ -238,7 +238,7 @@ def _superpose_matrix(
     along_z = (bench.section.component == 1).astype(float)
     half_side = bench.body.side / 2
     drawn_back = (step.rod.pressed - with_cube.rod.pressed) / half_side
-    contact = bench.rod_contact(step.rod)
+    contact = bench.make_rod_contact(step.rod)
     springs = contact.secant(u - drawn_back * along_z, field)
     matrix = matrix + springs[free][:, free]
     if with_cube is step:

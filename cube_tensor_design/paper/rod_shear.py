@@ -30,9 +30,9 @@ from cube_tensor_driver.touch.posterior import MODEL_ERROR
 
 from ..fem.body import Body
 from ..fem.fem import Progress, compute_response, count_steps
-from ..fem.line_load import line_load
+from ..fem.line_load import compute_line_load
 from ..fem.reciprocity import compute_influence
-from .experiments import SHEAR_SIGNS, dent
+from .experiments import SHEAR_SIGNS, make_dent_step
 from .rod import ROD_DEPTH, Rod
 from .virtual_bench import VirtualBench
 
@@ -91,7 +91,7 @@ def rod_shear(
     end = body.width / 2
     x = np.arange(-end, end + GRID_STEP / 2, GRID_STEP)
     layer = Layer(body.height, body.poisson)
-    tensor_kernel = line_load(layer, x, depth, body.side / 2)
+    tensor_kernel = compute_line_load(layer, x, depth, body.side / 2)
     pad_kernel = influence.at(x[:, None])
     shear_kernel = tensor_kernel[zx]
     from_tensor = _compute_shear_weights(tensor_kernel, shear_kernel, x, depth)
@@ -102,11 +102,11 @@ def rod_shear(
     rows = []
     for place in places:
         report(f"rod at {1e3 * place:g} mm")
-        step = dent(body, Rod(ROD_DEPTH, place))
+        step = make_dent_step(body, Rod(ROD_DEPTH, place))
         # The same rod at the same depth; with the cube it needs more force.
         pads = with_cube.run([step]).pads[0]
         modes = estimator @ pads
-        positions, force = with_cube.rod_pressure(step)
+        positions, force = with_cube.compute_rod_pressure(step)
         shear_at_rod = np.interp(positions, x, shear_kernel[:, 1])
         row = {
             "place": place,

@@ -9,7 +9,7 @@ contact with a rod (rod.py), in steps of the load. No step may turn an element i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
@@ -216,9 +216,9 @@ class VirtualBench:
         """Return the displacements (dofs,) under one step from rest; None if the step is too
         large."""
         rest = np.zeros(self.section.basis.N)
-        return self._newton(rest, self._make_task(step, rest))
+        return self._run_newton(rest, self._make_task(step, rest))
 
-    def rod_pressure(self, step: LoadStep) -> tuple[Array, Array]:
+    def compute_rod_pressure(self, step: LoadStep) -> tuple[Array, Array]:
         """Return the nodal forces with which a rod presses on the body in one step of a linear
         bench.
 
@@ -228,7 +228,7 @@ class VirtualBench:
         u = self.solve(step)
         if u is None or step.rod is None or self.finite:
             raise ElasticError("give a linear step with a rod, that presses less")
-        force = self.rod_contact(step.rod).force(u)
+        force = self.make_rod_contact(step.rod).force(u)
         is_along_z = self.section.component == 1
         dofs = np.flatnonzero((force != 0) & is_along_z)
         positions = self.section.basis.doflocs[0, dofs]
@@ -245,7 +245,7 @@ class VirtualBench:
         positions = self.section.basis.doflocs
         return pad_weights(positions, 2, layout, (0, 0), rotation)
 
-    def without_cube(self) -> VirtualBench:
+    def remove_cube(self) -> VirtualBench:
         """Return a linear bench of the same mesh, with elastomer in the cube's place."""
         bench = copy(self)
         material = self.section.material
@@ -262,11 +262,11 @@ class VirtualBench:
         task = self._make_task(step, np.zeros(self.section.basis.N))
         return np.flatnonzero(np.isnan(task.prescribed))
 
-    def rod_contact(self, rod: Rod) -> RodContact:
+    def make_rod_contact(self, rod: Rod) -> RodContact:
         """Return the contact of a rod with the top."""
         return RodContact(self._top, rod, self._half_side, self.body.young, self.finite)
 
-    def loaded(self, stress: Array, gradient: Array) -> Deformation:
+    def solve_field(self, stress: Array, gradient: Array) -> Deformation:
         """Solve for the outer tractions of the field sigma_ij = S_ij + G_ijk x_k / d0, linearly.
 
         The cube's centre stays where it is and its x axis does not rotate.
@@ -332,7 +332,7 @@ class VirtualBench:
     ) -> _Position:
         """Solve one step of the load from a guess of u; halve the step where Newton's method
         fails."""
-        u = self._newton(guess, task)
+        u = self._run_newton(guess, task)
         if u is not None:
             return _Position(u, task.rod)
         if halvings == STEP_HALVINGS:
@@ -357,25 +357,20 @@ class VirtualBench:
         prescribed = (start.u + task.prescribed) / 2
         return replace(task, prescribed=prescribed, rod=rod)
 
-    def _newton(self, u: Array, task: _Task) -> Array | None:
+    def _run_newton(self, u: Array, task: _Task) -> Array | None:
         """Return displacements (dofs,) in balance, found from the guess u; None if none were
         found."""
-        contact = self.rod_contact(task.rod) if task.rod else None
+        contact = self.make_rod_contact(task.rod) if task.rod else None
 
-        def tangents(u: Array) -> Iterator[sp.csr_matrix]:
-            tangent = self.section.tangent(u)
-            if contact is None:
-                yield tangent
-            else:
-                yield tangent + contact.tangent(u, curved=True)
-                # The rod's curvature can make the tangent indefinite, which gives no descent.
-                yield tangent + contact.tangent(u, curved=False)
+        def tangent(u: Array) -> sp.csr_matrix:
+            inner = self.section.tangent(u)
+            return inner if contact is None else inner + contact.tangent(u)
 
         # Even a linear body has a contact that is not linear.
         linear = not self.finite and contact is None
         balance = partial(self._balance, contact=contact)
         with np.errstate(all="ignore"):  # A failed attempt has inverted elements.
-            return find_balance(u, task.prescribed, task.rows, balance, tangents, linear)
+            return find_balance(u, task.prescribed, task.rows, balance, tangent, linear)
 
     def _balance(self, u: Array, contact: RodContact | None) -> Balance | None:
         """Return nodal forces out of balance, and energy; None when an element is inside out."""

@@ -62,7 +62,7 @@ class FieldStudy:
     widths: Array
     error: Array
 
-    def cubes_saved(self, error: float) -> Array:
+    def compute_cubes_saved(self, error: float) -> Array:
         """Return by what factor fewer cubes per area suffice for an error than if only their
         stresses are used.
 
@@ -153,7 +153,7 @@ def compute_true_components(
     Returns:
         `COMPONENTS` (N, 15), stresses in Pa and gradients in Pa/m.
     """
-    order = contact.hertz_order(width / 2, SURFACE_DEPTH)
+    order = contact.choose_hertz_order(width / 2, SURFACE_DEPTH)
     load = contact.hertz(width / 2, force, centre, order)
     field = compute_field_below(points, SURFACE_DEPTH, load, POISSONS_RATIO)
     # Of the gradients, those of the normal stresses come first.
@@ -212,7 +212,7 @@ def field_study(
         for row, width in enumerate(widths):
             # The same contacts for every pitch and width make the errors comparable.
             random = np.random.default_rng(SEED)
-            squares = [trial.square_errors(width, random) for _ in range(cases)]
+            squares = [trial.compute_square_errors(width, random) for _ in range(cases)]
             error[row, column] = np.sqrt(np.mean(squares, axis=0))
     return FieldStudy(pitches, widths, error)
 
@@ -233,7 +233,7 @@ class _Trial:
         self._window = from_centre < WINDOW / 2
         self._points = points[self._window]
 
-    def square_errors(self, width: float, random: np.random.Generator) -> list[float]:
+    def compute_square_errors(self, width: float, random: np.random.Generator) -> list[float]:
         """Return, by kind of skin, the mean square error of the pressure over its mean square
         under a random contact of this width."""
         centre = self._pitch * (random.random(2) - 0.5)

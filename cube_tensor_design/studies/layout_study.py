@@ -80,7 +80,7 @@ class LayoutStudy:
     offsets: Array
     error: dict[str, Array]
 
-    def trusted_widths(self, layout: str) -> Array:
+    def find_trusted_widths(self, layout: str) -> Array:
         """Return the width of the narrowest indenter from which on each error is below the limit.
 
         Args:

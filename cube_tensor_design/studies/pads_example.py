@@ -94,8 +94,8 @@ def sweep(points: int = 129) -> Sweep:
     calibration = read_planar_calibration()
     place = np.linspace(-REACH, REACH, points)
     zz, zx, zz_x = (COMPONENTS.index(name) for name in ("zz", "zx", "zz_x"))
-    at_sensor = _beside_ball(np.array([-BALL_X]))[0]
-    passing = _beside_ball(-place)
+    at_sensor = _compute_field_beside_ball(np.array([-BALL_X]))[0]
+    passing = _compute_field_beside_ball(-place)
     gradient = passing[:, 6:].reshape(points, 6, 3)
     pads = compute_true_state(calibration, passing[:, :6], gradient) @ calibration.response.T
 
@@ -106,7 +106,7 @@ def sweep(points: int = 129) -> Sweep:
     pair_gain = to_shear[left] - to_shear[right]
     return Sweep(
         place=place,
-        profile=_beside_ball(place - BALL_X)[:, zz],
+        profile=_compute_field_beside_ball(place - BALL_X)[:, zz],
         value=float(at_sensor[zz]),
         slope=float(at_sensor[zz_x]),
         truth=passing[:, zx],
@@ -115,7 +115,7 @@ def sweep(points: int = 129) -> Sweep:
     )
 
 
-def _beside_ball(x: Array) -> Array:
+def _compute_field_beside_ball(x: Array) -> Array:
     """Return stress in Pa and gradient in Pa/m (N, 6 + 18) at distances x (N,) from the ball's
     centre, in m, in the plane of the sensor."""
     ball = contact.hertz(BALL_RADIUS, BALL_FORCE)

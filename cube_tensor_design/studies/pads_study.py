@@ -76,7 +76,7 @@ class LayerBench(TractionBench):
             distance = np.abs(true.layout.positions - position).max(axis=1)
             self._pads.append(int(np.argmin(distance)))
 
-    def pads_under(
+    def compute_pads_under(
         self,
         width: float,
         force: Array,
@@ -95,7 +95,7 @@ class LayerBench(TractionBench):
         return np.einsum("pnsi,nsi->np", influence, local_forces)
 
 
-def coarse_influence() -> Influence:
+def compute_coarse_influence() -> Influence:
     """Compute influence functions on the coarsest mesh, which takes minutes.
 
     The study takes them as the true ones, while the inverse assumes those of a finer mesh.
@@ -129,7 +129,7 @@ def study_pads(
     }
 
 
-def layer_example(true: Influence) -> FieldExample:
+def compute_layer_example(true: Influence) -> FieldExample:
     """Return the pressure at the cubes' depth under a contact of 5 mm between 24-pad cubes.
 
     The pressure is the true one, and the one that the inverse with contacts computes for each of

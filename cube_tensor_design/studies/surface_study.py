@@ -28,7 +28,7 @@ from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.estimator import estimate_modes
 from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.core.modes import PLANE
-from cube_tensor_driver.core.symmetry import default_modes, find_largest_symmetry
+from cube_tensor_driver.core.symmetry import choose_default_modes, find_largest_symmetry
 from cube_tensor_driver.mechanics.contact_response import ContactResponse
 from cube_tensor_driver.mechanics.influence import Influence
 from cube_tensor_driver.mechanics.layer import FIELD, Layer
@@ -36,7 +36,7 @@ from cube_tensor_driver.mechanics.measurement_model import CubeMeasurement
 
 from ..fem.body import Body
 from ..fem.fem import Progress, compute_response, count_steps
-from ..fem.line_load import line_load
+from ..fem.line_load import compute_line_load
 from ..fem.reciprocity import compute_influence
 
 WIDTHS = (2e-3, 5e-3, 10e-3, 20e-3)
@@ -130,7 +130,7 @@ def study_surface(
     rows = []
     for load, width, offset in itertools.product(LOADS, widths, offsets):
         axis, sign = LOADS[load]
-        points, parts = hertz_points(width / 2, 1 if layout.planar else 2)
+        points, parts = make_hertz_points(width / 2, 1 if layout.planar else 2)
         points[:, 0] += offset
         # The integral of influence functions and traction, by reciprocity.
         pads = influence.at(points)[:, :, axis] @ (sign * parts)
@@ -154,7 +154,7 @@ def _compute_inverse_rows(
     """Return, for each component that the pads tell from all other modes, the row (P,) of the
     pseudo-inverse of the response matrix: from pad stresses to the component."""
     response = compute_response(body, layout, find_largest_symmetry(layout), meshes)
-    modes = default_modes(layout)
+    modes = choose_default_modes(layout)
     estimator = estimate_modes(response.matrix, modes, neglect)
     rows = {
         name: estimator.matrix[modes.names.index(name)]
@@ -186,7 +186,7 @@ def _compute_stress_in_plane(
         # Plane stress is plane strain of a material with this ratio.
         poisson = body.poisson / (1 + body.poisson)
     layer = Layer(body.height, poisson)
-    modes = line_load(layer, x, body.depth_of_cube, body.side / 2)
+    modes = compute_line_load(layer, x, body.depth_of_cube, body.side / 2)
     return {name: parts @ modes[PLANE.names.index(name)] for name in COMPONENTS}
 
 
@@ -203,7 +203,7 @@ def _compute_stress_in_space(
     return {name: field[FIELD.index(name)] for name in COMPONENTS}
 
 
-def hertz_points(radius: float, dim: int) -> tuple[Array, Array]:
+def make_hertz_points(radius: float, dim: int) -> tuple[Array, Array]:
     """Return point forces of a Hertzian contact, whose pressure falls as sqrt(1 - (r/radius)^2).
 
     Args:

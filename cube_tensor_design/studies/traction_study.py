@@ -211,7 +211,7 @@ class TractionBench:
         load = self.point_forces(width, force, centre)
         return compute_field_below(points, depth, load, self.setting.poisson)
 
-    def surface_truth(
+    def compute_surface_truth(
         self,
         width: float,
         force: Array,
@@ -247,9 +247,9 @@ class TractionBench:
     ) -> Array:
         """Return stress and gradient (cubes, 15), in Pa and Pa/m, that the pipeline computes under
         a load."""
-        return self.measured(self.pads_under(width, force, centre), random)
+        return self.measured(self.compute_pads_under(width, force, centre), random)
 
-    def pads_under(
+    def compute_pads_under(
         self,
         width: float,
         force: Array,
@@ -257,9 +257,9 @@ class TractionBench:
     ) -> Array:
         """Return the pad stresses (cubes, P), in Pa, under a load."""
         cubes = self.poses.position[:, :2]
-        return self.pads_in(self.truth(cubes, width, force, centre))
+        return self.compute_pads_in(self.truth(cubes, width, force, centre))
 
-    def pads_in(self, field: Array) -> Array:
+    def compute_pads_in(self, field: Array) -> Array:
         """Return the pad stresses (cubes, P), in Pa, in a field (cubes, 6 + 18) of stress and
         gradient in the skin's frame."""
         calibration = self.calibration
@@ -348,7 +348,7 @@ class TractionBench:
         field = (errors**2).mean(axis=1) / mean_square
 
         predicted = tracker.deviation(values)
-        on_surface = self.surface_truth(width, force, centre)
+        on_surface = self.compute_surface_truth(width, force, centre)
         below = errors[-1] / predicted.depth_pressure[self.window]
         surface = (tracker.field.pressure - on_surface) / predicted.pressure
         found = [sum_contact_errors(contacts, centre) for contacts in (interpolated, tracked)]

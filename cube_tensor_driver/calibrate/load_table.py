@@ -18,7 +18,7 @@ from ..core.arrays import Array
 from ..core.errors import ConfigError, FitError
 from ..core.layout import Layout
 from ..core.modes import Modes
-from ..core.symmetry import default_modes
+from ..core.symmetry import choose_default_modes
 from .fit import loads_from_forces
 
 FORCE = ("fx", "fy", "fz")
@@ -81,7 +81,7 @@ def read_loads(
             no number, or the table has forces and no area is given.
     """
     header, cells = _read_cells(path)
-    modes = default_modes(layout)
+    modes = choose_default_modes(layout)
     _check_columns(path, header, layout, modes)
     columns = dict(zip(header, cells.T, strict=True))
     by_pad = [columns[pad] for pad in layout.pads]

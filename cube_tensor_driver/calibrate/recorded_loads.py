@@ -21,7 +21,7 @@ from ..core.errors import BagError
 from ..core.layout import Layout
 from ..core.modes import COMPONENTS, STRESS
 from ..core.rows import concatenate
-from ..core.symmetry import default_modes
+from ..core.symmetry import choose_default_modes
 from ..messages.codec import SECOND
 from ..messages.types import STRESS as BATCH_TYPE
 from .fit import loads_from_forces
@@ -252,7 +252,7 @@ def _read_reference(
             f"{bag.path}: {len(stamp_ns)} messages on {topic}; needed are two or more, with times"
         )
     values = values[first]
-    modes = default_modes(layout)
+    modes = choose_default_modes(layout)
     if msgtype == WRENCH_TYPE:
         if area is None:
             raise BagError(

@@ -21,8 +21,8 @@ from .errors import CalibrationError, LayoutError, SymmetryError
 from .layout import LAYOUTS, Layout, find_layout
 from .modes import COMPONENTS, STRESS, Modes
 from .oscillator import TemperatureModel
-from .response import illustrative_coefficients, response
-from .symmetry import Structure, default_modes, find_largest_symmetry, find_structure
+from .response import choose_illustrative_coefficients, response
+from .symmetry import Structure, choose_default_modes, find_largest_symmetry, find_structure
 
 SCHEMA = 1
 """Version of the format of calibration files, which each file states under the key "schema"."""
@@ -213,7 +213,7 @@ class Calibration:
     def modes(self) -> Modes:
         """The M modes (linear stress fields). The response matrix (P, M) turns their amplitudes
         into the stresses on the P pads of this pad layout."""
-        return default_modes(self.layout)
+        return choose_default_modes(self.layout)
 
     @property
     def structure(self) -> Structure:
@@ -392,7 +392,7 @@ def illustrative(
         neglect=tuple(neglect),
         uid=uid,
         half_side=HALF_SIDE,
-        coefficients=illustrative_coefficients(structure),
+        coefficients=choose_illustrative_coefficients(structure),
         rest_frequency=np.array(REST_FREQUENCY),
         beta=np.array(BETA),
         modulus=np.array(FOAM_MODULUS),

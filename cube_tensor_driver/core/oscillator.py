@@ -47,8 +47,8 @@ def pad_stress(
         modulus: Modulus of the pad's foam, in Pa.
 
     Returns:
-        Stresses; NaN for frequencies outside 0 < f < `highest_frequency`, which no thickness of
-        the foam explains.
+        Stresses; NaN for frequencies outside 0 < f < `find_highest_frequency`, which no thickness
+        of the foam explains.
     """
     f = np.asarray(frequency)
     f0 = np.asarray(rest_frequency)
@@ -89,7 +89,7 @@ def pad_frequency(
         return np.where(is_possible, f, np.nan)
 
 
-def highest_frequency(rest_frequency: ArrayLike, beta: ArrayLike) -> Array:
+def find_highest_frequency(rest_frequency: ArrayLike, beta: ArrayLike) -> Array:
     """Compute the upper limit f0 (1 + beta) / beta of a pad's frequency, in Hz.
 
     The frequency approaches this limit when the foam becomes infinitely thick. Without parasitic

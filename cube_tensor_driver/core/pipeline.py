@@ -47,7 +47,7 @@ from .kernel.rows import (
 )
 from .kernel.run import run
 from .modes import GRADIENT, STRESS
-from .oscillator import highest_frequency
+from .oscillator import find_highest_frequency
 from .rows import FrequencyRows, StressRows
 from .status import INVALID, STAMP
 
@@ -215,7 +215,7 @@ class Pipeline:
         self._rest = np.where(exists, rest, np.nan)
         self.rest_changes += 1
         self._tables.rest[:] = self._rest
-        self._tables.highest[:] = highest_frequency(self._rest, self._beta[group])
+        self._tables.highest[:] = find_highest_frequency(self._rest, self._beta[group])
 
     @property
     def stiffness(self) -> Array:
@@ -228,7 +228,7 @@ class Pipeline:
         stiffness: Array = self._stiffness[self._tables.calibration]
         return stiffness
 
-    def unloaded_factor(
+    def compute_unloaded_factor(
         self,
         cube: Index,
         temperature: Real,

@@ -72,7 +72,7 @@ MAX_LISTED_NAMES = 6
 """Maximum number of names that an error message lists; of further names it states the number."""
 
 
-def illustrative_coefficients(structure: Structure) -> dict[str, float]:
+def choose_illustrative_coefficients(structure: Structure) -> dict[str, float]:
     """Return illustrative coefficients of the response of a built-in layout.
 
     Args:
@@ -97,7 +97,7 @@ def illustrative_coefficients(structure: Structure) -> dict[str, float]:
     # A smaller symmetry has more coefficients. They are computed from the response matrix of the
     # largest symmetry, whose coefficients are known.
     symmetric = find_structure(layout, find_largest_symmetry(layout))
-    matrix = response(symmetric, illustrative_coefficients(symmetric))
+    matrix = response(symmetric, choose_illustrative_coefficients(symmetric))
     coefficients, _ = project(structure, matrix)
     return coefficients
 

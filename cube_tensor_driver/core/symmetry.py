@@ -202,7 +202,7 @@ class Structure:
         return orbits
 
 
-def default_modes(layout: Layout) -> Modes:
+def choose_default_modes(layout: Layout) -> Modes:
     """Return the modes (components of stress and gradient) that a layout of pads can measure.
 
     They are `PLANE` for pads in one plane, `SPACE` otherwise.
@@ -221,12 +221,12 @@ def find_structure(
     Args:
         layout: Layout of the pads.
         symmetry: Name of the symmetry group, a key of `GENERATORS`.
-        modes: Modes (linear stress fields); by default `default_modes` of the layout.
+        modes: Modes (linear stress fields); by default `choose_default_modes` of the layout.
 
     Raises:
         SymmetryError: The layout does not have this symmetry.
     """
-    modes = modes or default_modes(layout)
+    modes = modes or choose_default_modes(layout)
     elements = find_layout_group(layout, symmetry)
     pad_images = np.array([map_pads(layout, element) for element in elements])
     actions = [modes.action(element) for element in elements]

@@ -37,7 +37,7 @@ Arrays = dict[str, AnyArray]
 """Arrays by name, as in one .npz file."""
 
 
-def cache_folder() -> Path:
+def find_cache_folder() -> Path:
     """Return the folder of the cached files, below XDG_CACHE_HOME or else below ~/.cache."""
     home = os.environ.get("XDG_CACHE_HOME")
     parent = Path(home) if home else Path.home() / ".cache"
@@ -59,7 +59,7 @@ def load_or_compute(
     Returns:
         The arrays by name, the same whether they were loaded or computed.
     """
-    path = cache_folder() / f"{kind}-{_hash_inputs(inputs)}.npz"
+    path = find_cache_folder() / f"{kind}-{_hash_inputs(inputs)}.npz"
 
     arrays = _load(path)
     if arrays is not None:

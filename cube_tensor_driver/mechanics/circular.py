@@ -104,7 +104,7 @@ The parts are a row vector on the left of the matrix: ``field = parts @ FIELD_FR
 """
 
 
-def rotation_phases(rotation: Complex, order: Orders) -> Complex:
+def compute_rotation_phases(rotation: Complex, order: Orders) -> Complex:
     """Return the phases exp(i m angle) by which rotations multiply circular components of order m.
 
     They are computed as powers of exp(i angle), because exponential functions take three times as
@@ -156,7 +156,7 @@ def rotate_loads(
     along_y = sine * radial + cosine * across
     loads = np.stack([along_x, along_y, normal], axis=1)
 
-    phases = rotation_phases(np.exp(1j * angle), order)
+    phases = compute_rotation_phases(np.exp(1j * angle), order)
     rotated = phases[:, None] * loads
     return np.concatenate([rotated.real, rotated.imag], axis=2)
 
@@ -175,7 +175,7 @@ def sum_rotated(
     Returns:
         Stress (N, 6) and gradient (N, 6, 3) in the frame of each cube, summed over the L fields.
     """
-    phases = rotation_phases(rotation.astype(np.complex64), ORDERS)
+    phases = compute_rotation_phases(rotation.astype(np.complex64), ORDERS)
     total = (circular * phases).sum(axis=1)
 
     parts = np.concatenate([total.real, total.imag], axis=1)

@@ -147,7 +147,7 @@ def hertz(
     The traction at the distance r from the centre is 3 F / (2 pi a^2) sqrt(1 - r^2 / a^2), with the
     force F and the radius a (Johnson, Contact Mechanics, 4.2 for pressing and 7.1 for sliding).
     Arguments, result and exceptions are those of `disc`. The default order is accurate at depths of
-    at least half the radius; `hertz_order` returns the order for any depth.
+    at least half the radius; `choose_hertz_order` returns the order for any depth.
     """
     nodes, weights = _compute_gauss_points(order)
     # The Gauss points are placed in t = sqrt(1 - r^2) instead of r. The integrand p r dr = t^2 dt
@@ -163,7 +163,7 @@ def hertz(
     )
 
 
-def hertz_order(radius: float, depth: float) -> int:
+def choose_hertz_order(radius: float, depth: float) -> int:
     """Return the quadrature order with which the point forces of `hertz` are accurate at a depth.
 
     The order is the number of rings on which the point forces lie.

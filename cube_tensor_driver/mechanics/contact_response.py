@@ -20,11 +20,11 @@ import numpy as np
 
 from ..core.arrays import Array, Complex, Index, Single
 from .cache import Arrays, load_or_compute
-from .circular import FIELD_FROM_CIRCULAR, ORDERS, Orders, rotate_loads, rotation_phases
-from .distance_table import DistanceTable, cubic_weights, to_polar
-from .load_response import disc_spectrum
+from .circular import FIELD_FROM_CIRCULAR, ORDERS, Orders, compute_rotation_phases, rotate_loads
+from .distance_table import DistanceTable, compute_cubic_weights, to_polar
+from .load_response import compute_disc_spectrum
 from .measurement_model import CubeMeasurement
-from .sensitivity import sensitivities
+from .sensitivity import compute_sensitivities
 from .spectra import BesselTable, Spectra, tabulate_bessel
 
 DISC_SIZES = np.geomspace(0.1, 5.0, 44)
@@ -74,7 +74,7 @@ class ContactResponse:
         self._rows = rows.astype(np.float32)
         self._point_matrix = cubes.point_matrix.astype(np.float32)
         changes = []
-        for spectra in sensitivities(cubes.layer, cubes.depth):
+        for spectra in compute_sensitivities(cubes.layer, cubes.depth):
             change = self._tabulate_discs(spectra, bessel)
             changes.append(change)
         by_quantity = np.stack(changes, axis=2).astype(np.float32)
@@ -94,7 +94,7 @@ class ContactResponse:
 
         def compute() -> Arrays:
             radii = DISC_SIZES * self._depth
-            loads = [disc_spectrum(spectra.k * radius) for radius in radii]
+            loads = [compute_disc_spectrum(spectra.k * radius) for radius in radii]
             return {"discs": spectra.radial(bessel, np.stack(loads))}
 
         return load_or_compute("discs", inputs, compute)["discs"]
@@ -195,7 +195,7 @@ class ContactResponse:
         circular[:, 6] = by_log_twice
         circular[:, 7] = moment
         in_cube = np.exp(1j * (direction - angle))
-        phases = rotation_phases(in_cube.astype(np.complex64), self._order)
+        phases = compute_rotation_phases(in_cube.astype(np.complex64), self._order)
         circular *= phases[:, None]
         return self._cubes.measure(_split(circular), variant)
 
@@ -213,7 +213,7 @@ class ContactResponse:
         """
         first, by_distance, distance_slope = self._table.weights(distance, 2)
         size_index = _find_size_index(size, self._depth)
-        size_row, *by_size = cubic_weights(size_index, 3)
+        size_row, *by_size = compute_cubic_weights(size_index, 3)
 
         # Bicubic interpolation uses 16 rows of the table: four radii times four distances.
         columns = self._response.shape[1]
@@ -361,7 +361,7 @@ class ContactResponse:
         circular.real = by_radial + by_normal
         circular.imag = in_plane.imag * t
         in_cube = np.exp(1j * (direction - angle))
-        phases = rotation_phases(in_cube.astype(np.complex64), order)
+        phases = compute_rotation_phases(in_cube.astype(np.complex64), order)
         circular *= phases[:, None]
         return circular
 
@@ -429,7 +429,7 @@ class ContactResponse:
         n_distances = int(min(last_step, self._table.last)) + 4
 
         size_index = _find_size_index(size, self._depth)
-        first, weights = cubic_weights(size_index)
+        first, weights = compute_cubic_weights(size_index)
         start = int(first) - 1
         neighbours = discs[start : start + 4, :n_distances]
         return np.asarray(np.tensordot(weights, neighbours, axes=1))

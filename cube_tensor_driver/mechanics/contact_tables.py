@@ -42,8 +42,8 @@ from .cache import Arrays, load_or_compute
 from .circular import ORDERS, sum_rotated
 from .distance_table import POINTS_PER_DEPTH, REACH_DEPTHS
 from .layer import Layer
-from .load_response import disc_spectrum
-from .spectra import layer_spectra, tabulate_bessel
+from .load_response import compute_disc_spectrum
+from .spectra import compute_layer_spectra, tabulate_bessel
 
 CONTACT_SIZES = np.geomspace(0.1, 5.0, 23)
 """Radii of the tabulated round contacts, divided by the depth of the cubes' centres below the
@@ -169,9 +169,9 @@ class DiscTables(_ContactTables):
     _kind = "disc_tables"
 
     def _compute(self) -> Arrays:
-        spectra = layer_spectra(self.layer, self.depth)
+        spectra = compute_layer_spectra(self.layer, self.depth)
         radii = CONTACT_SIZES * self.depth
-        disc_spectra = [disc_spectrum(spectra.k * radius) for radius in radii]
+        disc_spectra = [compute_disc_spectrum(spectra.k * radius) for radius in radii]
 
         distance = np.arange(_LAST_DISTANCE + 2) * self.depth / POINTS_PER_DEPTH
         bessel = tabulate_bessel(spectra.k, distance)
@@ -323,7 +323,7 @@ class PolygonTables(_ContactTables):
             Spline over r (divided by the depth) of the integrals (..., 4, 14) from 0 to r: the
             inner integrals of A, B, Z and W at the head of this file.
         """
-        spectra = layer_spectra(self.layer, self.depth)
+        spectra = compute_layer_spectra(self.layer, self.depth)
         r = np.arange(_LAST_DISTANCE + 2) / POINTS_PER_DEPTH
         bessel = tabulate_bessel(spectra.k, r * self.depth)
         point_force = np.ones((1, len(spectra.k)))

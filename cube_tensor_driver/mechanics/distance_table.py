@@ -92,7 +92,7 @@ class DistanceTable:
         index, decay = self.locate(distance)
         # Row 0 is one step before the distance 0. So row `below` is one step before the largest
         # tabulated distance that is not above the given one, and is the first of the four rows.
-        below, *weights = cubic_weights(index, count)
+        below, *weights = compute_cubic_weights(index, count)
         return below, *(one * decay for one in weights)
 
     def locate(self, distance: Array) -> tuple[Array, Array]:
@@ -133,7 +133,7 @@ class DistanceTable:
         return np.asarray(sum(terms))
 
 
-def cubic_weights(
+def compute_cubic_weights(
     index: Array | float,
     count: int = 1,
 ) -> tuple[Array, ...]:

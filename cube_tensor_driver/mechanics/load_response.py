@@ -69,7 +69,7 @@ class LoadResponse:
         cell = (spacing / (2 * np.pi)) ** 2
         for kx in k[count:, None]:
             wavenumber = np.hypot(kx, k)
-            load = disc_spectrum(wavenumber * width / 2) * cell
+            load = compute_disc_spectrum(wavenumber * width / 2) * cell
             transfer = layer.transfer(kx, k, depth)
             response = load[:, None, None] * transfer
             amplitude = response.sum(axis=0)
@@ -115,7 +115,7 @@ class LoadResponse:
         return np.asarray(components.swapaxes(1, 2))
 
 
-def disc_spectrum(x: Array) -> Array:
+def compute_disc_spectrum(x: Array) -> Array:
     """Compute the spectrum (Fourier transform) B of the pressure of a Hertz contact with 1 N.
 
     Args:

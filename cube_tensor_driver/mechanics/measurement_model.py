@@ -16,9 +16,9 @@ import numpy as np
 
 from ..core.arrays import Array, Index
 from ..core.modes import COMPONENTS, STRESS
-from .circular import FIELD_FROM_CIRCULAR, rotation_phases
+from .circular import FIELD_FROM_CIRCULAR, compute_rotation_phases
 from .layer import MEASURED, Layer
-from .spectra import Spectra, layer_spectra
+from .spectra import Spectra, compute_layer_spectra
 
 _IS_GRADIENT = np.arange(len(COMPONENTS)) >= len(STRESS)
 """Whether each of the 15 `COMPONENTS` is a gradient in Pa/m; the others are stresses in Pa."""
@@ -89,7 +89,7 @@ class CubeMeasurement:
         self.layer = layer
         self.depth = depth
         self._unit_factors = np.where(_IS_GRADIENT, scale, 1.0)
-        self.point_spectra = layer_spectra(layer, depth)
+        self.point_spectra = compute_layer_spectra(layer, depth)
         self.point_matrix: Array = FIELD_FROM_CIRCULAR[:, MEASURED] * self._unit_factors
         self.spectra = self.point_spectra
         self.matrices = self.point_matrix[None]
@@ -157,7 +157,7 @@ class CubeMeasurement:
             Two matrices (N, 15, n): for the real parts of the circular components, and for their
             imaginary parts.
         """
-        phases = rotation_phases(np.exp(1j * angle), self.spectra.order)
+        phases = compute_rotation_phases(np.exp(1j * angle), self.spectra.order)
         transposed = self.matrices.swapaxes(1, 2)
         real, imaginary = np.split(transposed, 2, axis=2)
         # A rotation of the frame multiplies each circular component by a phase. Multiplying its

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from .layer import Layer
-from .spectra import Spectra, layer_spectra
+from .spectra import Spectra, compute_layer_spectra
 
 DEPTH_DEVIATION = 0.03
 """Prior standard deviation of the depth of the cubes' centres, divided by the depth: 0.15 mm at a
@@ -32,11 +32,11 @@ _STEP = 1e-3
 the thickness."""
 
 
-def sensitivities(layer: Layer, depth: float) -> list[Spectra]:
+def compute_sensitivities(layer: Layer, depth: float) -> list[Spectra]:
     """Compute how errors of depth, Poisson's ratio and thickness change the spectra of a layer.
 
     The spectra are the responses of stress and gradient at a depth to waves of traction on the
-    surface, as functions of the wavenumber (`layer_spectra`).
+    surface, as functions of the wavenumber (`compute_layer_spectra`).
 
     Args:
         layer: Elastic layer.
@@ -46,20 +46,20 @@ def sensitivities(layer: Layer, depth: float) -> list[Spectra]:
         Changes of the spectra for one standard deviation of the depth, of Poisson's ratio and, in a
         layer of finite thickness, of the thickness.
     """
-    base = layer_spectra(layer, depth)
+    base = compute_layer_spectra(layer, depth)
     # The finite differences are one-sided, and their steps do not leave the allowed ranges: the
     # depth is reduced, and Poisson's ratio (0 to 0.5) is changed towards 0.25.
     poisson_step = _STEP if layer.poisson < 0.25 else -_STEP
     softer = replace(layer, poisson=layer.poisson + poisson_step)
-    of_softer = layer_spectra(softer, depth)
-    shallower = layer_spectra(layer, (1 - _STEP) * depth, depth)
+    of_softer = compute_layer_spectra(softer, depth)
+    shallower = compute_layer_spectra(layer, (1 - _STEP) * depth, depth)
     changes = [
         _subtract(shallower, base, -DEPTH_DEVIATION / _STEP),
         _subtract(of_softer, base, POISSON_DEVIATION / poisson_step),
     ]
     if np.isfinite(layer.thickness):
         thicker = replace(layer, thickness=(1 + _STEP) * layer.thickness)
-        of_thicker = layer_spectra(thicker, depth)
+        of_thicker = compute_layer_spectra(thicker, depth)
         changes.append(_subtract(of_thicker, base, THICKNESS_DEVIATION / _STEP))
     return changes
 

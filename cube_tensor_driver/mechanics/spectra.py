@@ -235,7 +235,7 @@ def tabulate_bessel(k: Array, r: Array) -> BesselTable:
     return evaluate
 
 
-def wavenumber_quadrature(depth: float) -> tuple[Array, Array]:
+def make_wavenumber_quadrature(depth: float) -> tuple[Array, Array]:
     """Return Gauss points for integrals over the wavenumber k.
 
     Args:
@@ -250,7 +250,7 @@ def wavenumber_quadrature(depth: float) -> tuple[Array, Array]:
     return k, weights * half_range * k / (2 * np.pi)
 
 
-def layer_spectra(
+def compute_layer_spectra(
     layer: Layer,
     depth: float,
     waves_of: float | None = None,
@@ -263,13 +263,13 @@ def layer_spectra(
     Args:
         layer: Elastic layer.
         depth: Distance from the point to the surface, in m.
-        waves_of: Another depth in m, whose wavenumbers (`wavenumber_quadrature`) are used instead
-            of those of `depth`. Only spectra with the same wavenumbers can be subtracted.
+        waves_of: Another depth in m, whose wavenumbers (`make_wavenumber_quadrature`) are used
+            instead of those of `depth`. Only spectra with the same wavenumbers can be subtracted.
 
     Raises:
         ElasticError: The layer does not contain this depth.
     """
-    k, weight = wavenumber_quadrature(waves_of or depth)
+    k, weight = make_wavenumber_quadrature(waves_of or depth)
     along_x = layer.transfer(k, np.zeros_like(k), depth)
     circular = np.einsum("cf,kfi->kci", CIRCULAR_FROM_FIELD, along_x)
 

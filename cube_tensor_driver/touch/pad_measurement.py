@@ -37,7 +37,7 @@ from ..core.pipeline import Pipeline
 from ..mechanics.cache import Arrays, load_or_compute
 from ..mechanics.influence import Influence
 from ..mechanics.measurement_model import MeasurementModel
-from ..mechanics.spectra import BesselTable, Spectra, tabulate_bessel, wavenumber_quadrature
+from ..mechanics.spectra import BesselTable, Spectra, make_wavenumber_quadrature, tabulate_bessel
 
 N_DIRECTIONS = 32
 """Number of equally spaced directions from the force to the cube at which the influence functions
@@ -187,7 +187,7 @@ def _decompose(influence: Influence) -> tuple[Spectra, Array]:
     ]
     largest = max(values[0] for _, values, _ in decompositions)
 
-    k, wave_weight = wavenumber_quadrature(influence.depth)
+    k, wave_weight = make_wavenumber_quadrature(influence.depth)
     bessel = tabulate_bessel(k, r)
     orders: list[int] = []
     spectra = []

@@ -76,7 +76,7 @@ def run_emulated(options: argparse.Namespace) -> int:
     from ..firmware import Emulator, build, need
 
     need("the emulated hub", "make", "arm-none-eabi-gcc", "qemu-system-arm")
-    skin, hub = skin_of_hub(options.config)
+    skin, hub = read_skin_of_hub(options.config)
     script = default_script() if options.load is None else read_script(options.load)
     build(SOURCE, OUT, "an386")
     # The pads live in this process; the emulated hub measures them over a socket.
@@ -95,7 +95,7 @@ def run_emulated(options: argparse.Namespace) -> int:
     return 0
 
 
-def skin_of_hub(path: Path | None) -> tuple[Skin, HubCubes]:
+def read_skin_of_hub(path: Path | None) -> tuple[Skin, HubCubes]:
     """Return the skin whose pads the emulated hub measures, and the cubes of the hub.
 
     Raises:

@@ -29,7 +29,7 @@ def once_a_second(transcript: Transcript, kind: type) -> str:
     """Return what is wrong with the times of frames of a kind, which must come once a second while
     the hub has stopped and while it has started; "" if nothing is."""
     for step, state in (("quiet", "stopped"), ("start", "started")):
-        heard = of_kind(transcript, kind, step)
+        heard = select_kind(transcript, kind, step)
         what = f"{kind.__name__.upper()} while {state}"
         if len(heard) < 3:
             return f"{len(heard)} {what} in a time in which 3 were due"
@@ -41,13 +41,13 @@ def once_a_second(transcript: Transcript, kind: type) -> str:
     return ""
 
 
-def frames_per_sample(transcript: Transcript) -> int:
+def count_frames_per_sample(transcript: Transcript) -> int:
     """Return the number of frames that most samples consist of."""
     frames = Counter(sample.sequence for sample in transcript.frames(Sample))
     return mode(frames.values())
 
 
-def of_kind(transcript: Transcript, kind: type, *names: str) -> list[Heard]:
+def select_kind(transcript: Transcript, kind: type, *names: str) -> list[Heard]:
     """Return the frames of a kind with their times, in the named steps."""
     return [heard for heard in transcript.heard(*names) if isinstance(heard.frame, kind)]
 
@@ -71,8 +71,8 @@ def is_late_after_power_up(transcript: Transcript) -> bool:
 
     The moment of power-up follows from the uptime in STATS.
     """
-    stats = of_kind(transcript, Stats, "opened")
-    hellos = of_kind(transcript, Hello, "opened")
+    stats = select_kind(transcript, Stats, "opened")
+    hellos = select_kind(transcript, Hello, "opened")
     if not stats or not isinstance(stats[0].frame, Stats):
         return False
     power_up_s = stats[0].at_s - 1e-3 * stats[0].frame.uptime_ms
@@ -145,7 +145,7 @@ def cubes_stay(transcript: Transcript) -> RuleResult:
 
     Whether it is the number of HELLO is for S5 to check.
     """
-    frames = frames_per_sample(transcript)
+    frames = count_frames_per_sample(transcript)
     hello, last = 0, None
     for frame in transcript.visit_frames():
         if isinstance(frame, Hello):

@@ -12,7 +12,7 @@ from cube_tensor_driver.device.wire.protocol import Ack, Command, Hello, Result,
 from ..conversation import PERIOD_US, UNKNOWN
 from ..rule import RuleResult, failed, never_tried, not_tried, passed, rule
 from ..transcript import CheckStep, Transcript
-from .sample import first_frames, periods_us
+from .sample import compute_periods_us, find_first_frames
 
 MAX_SHIFT = 0.1
 """Largest shift of the sampling times, as a share of the sample period, that is taken for the delay
@@ -110,7 +110,7 @@ def period_is_kept(transcript: Transcript) -> RuleResult:
     wrong = _find_other_period(transcript)
     if wrong:
         return failed(wrong)
-    gaps = periods_us(transcript.frames(Sample, "start"))
+    gaps = compute_periods_us(transcript.frames(Sample, "start"))
     if len(gaps) < MIN_PERIODS:
         return not_tried(f"{len(gaps)} periods came in the step 'start', 3 are needed")
     middle = float(np.median(gaps))
@@ -211,7 +211,7 @@ def start_and_stop_again(transcript: Transcript) -> RuleResult:
 
 def phases(samples: list[Sample], period_us: int) -> Array:
     """Return the phase (0 to 1) of the device time of each sample within the sample period."""
-    times = [sample.device_us for sample in first_frames(samples)]
+    times = [sample.device_us for sample in find_first_frames(samples)]
     return np.array(times) % max(1, period_us) / max(1, period_us)
 
 
@@ -222,7 +222,7 @@ def new_period_at_once(transcript: Transcript) -> RuleResult:
     if not period_us or period_us == in_force(transcript.steps["period"]):
         return not_tried("the hub did not take another period")
     # The first gap behind the ACK may still have begun with the old period.
-    gaps = periods_us(behind_ack(transcript.steps["slower"], Command.SET_PERIOD))[1:]
+    gaps = compute_periods_us(behind_ack(transcript.steps["slower"], Command.SET_PERIOD))[1:]
     if len(gaps) < MIN_PERIODS:
         return failed(f"{len(gaps) + 1} periods came after a new period of {period_us} µs")
     # There are few gaps, so the limit is wide; R3 checks the period closely.

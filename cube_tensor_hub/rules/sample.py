@@ -20,7 +20,7 @@ from cube_tensor_driver.device.wire.protocol import Hello, Sample, Stats
 from ..conversation import UNREAD_S
 from ..rule import RuleResult, failed, not_tried, passed, rule
 from ..transcript import Transcript
-from .hello import frames_per_sample, of_kind, once_a_second
+from .hello import count_frames_per_sample, once_a_second, select_kind
 
 MAX_STATS_GAP_S = 2.5
 """Largest difference of the uptimes in two successive STATS, in seconds, which a hub sends once a
@@ -56,17 +56,17 @@ def forward(later: int, earlier: int) -> int:
     return (later - earlier + half) % COUNTER_RANGE - half
 
 
-def first_frames(samples: list[Sample]) -> list[Sample]:
+def find_first_frames(samples: list[Sample]) -> list[Sample]:
     """Return the first frame of each sample."""
     later = [b for a, b in pairwise(samples) if b.sequence != a.sequence]
     return [*samples[:1], *later]
 
 
-def periods_us(samples: list[Sample]) -> Array:
+def compute_periods_us(samples: list[Sample]) -> Array:
     """Return the device time from sample to sample, per sequence number, in µs."""
     gaps = [
         (after.device_us - before.device_us) / forward(after.sequence, before.sequence)
-        for before, after in pairwise(first_frames(samples))
+        for before, after in pairwise(find_first_frames(samples))
         if forward(after.sequence, before.sequence) > 0
     ]
     return np.array(gaps)
@@ -74,7 +74,7 @@ def periods_us(samples: list[Sample]) -> Array:
 
 def sample_rate(samples: list[Sample]) -> float:
     """Return the median rate of samples by their device times, in Hz; 0 if it is not known."""
-    gaps = periods_us(samples)
+    gaps = compute_periods_us(samples)
     median = float(np.median(gaps)) if len(gaps) else 0.0
     return 1e6 / median if median > 0 else 0.0
 
@@ -114,7 +114,7 @@ def numbers_go_on(transcript: Transcript) -> RuleResult:
 )
 def device_time_runs(transcript: Transcript) -> RuleResult:
     """Device time must grow, agree with the uptime, and run at the rate of the host's clock."""
-    samples = first_frames(transcript.visit(Sample))
+    samples = find_first_frames(transcript.visit(Sample))
     for before, after in pairwise(samples):
         if forward(after.sequence, before.sequence) > 0 and after.device_us <= before.device_us:
             return failed(
@@ -127,14 +127,14 @@ def device_time_runs(transcript: Transcript) -> RuleResult:
     if stats and abs(device_s - 1e-3 * stats[-1].uptime_ms) > MAX_UPTIME_DIFFERENCE_S:
         uptime_s = 1e-3 * stats[-1].uptime_ms
         return failed(f"device time is {device_s:.3f} s, the uptime in STATS {uptime_s:.3f} s")
-    flow = of_kind(transcript, Sample, "start")
+    flow = select_kind(transcript, Sample, "start")
     if len(flow) < MIN_DRIFT_SAMPLES:
         return not_tried(
             f"{len(flow)} samples came in the step 'start', {MIN_DRIFT_SAMPLES} are needed"
         )
     host_us = np.array([1e6 * heard.at_s for heard in flow])
     device_us = np.array([float(sample.device_us) for sample in transcript.frames(Sample, "start")])
-    drift, unsure, jitter = drift_of(host_us - host_us[0], device_us - device_us[0])
+    drift, unsure, jitter = measure_drift(host_us - host_us[0], device_us - device_us[0])
     text = f"{1e6 * drift:+.0f} ± {1e6 * unsure:.0f} ppm against the host, jitter {jitter:.0f} µs"
     # `MAX_DRIFT` is the largest drift that the driver's estimate of the clock allows.
     if abs(drift) - unsure > MAX_DRIFT:
@@ -142,7 +142,7 @@ def device_time_runs(transcript: Transcript) -> RuleResult:
     return passed(f"never back, {text}")
 
 
-def drift_of(host: Array, device: Array) -> tuple[float, float, float]:
+def measure_drift(host: Array, device: Array) -> tuple[float, float, float]:
     """Compare the rates of two clocks.
 
     The delay of an arrival is never negative, so that the arrivals with the smallest delay in both
@@ -211,7 +211,7 @@ def drops_are_counted(transcript: Transcript) -> RuleResult:
     """
     base = transcript.visit(Stats)[0].dropped
     frames = Counter(sample.sequence for sample in transcript.visit(Sample))
-    n_frames = frames_per_sample(transcript)
+    n_frames = count_frames_per_sample(transcript)
     missing, counted = 0, 0
     previous: int | None = None
     for frame in transcript.visit_frames():

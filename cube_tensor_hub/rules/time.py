@@ -11,7 +11,7 @@ from cube_tensor_driver.device.wire.protocol import Command, Result, Sample, Tim
 
 from ..rule import RuleResult, failed, never_tried, not_tried, passed, rule
 from ..transcript import Transcript
-from .hello import of_kind
+from .hello import select_kind
 from .request import in_force
 
 MAX_RATE_DIFFERENCE = 0.02
@@ -116,7 +116,7 @@ def clock_of_samples(transcript: Transcript) -> RuleResult:
     """A sample comes after it was measured, and the first one is measured after START."""
     trips = time_exchanges(transcript, "before start")
     step = transcript.steps["start at once"]
-    samples = of_kind(transcript, Sample, "start at once")
+    samples = select_kind(transcript, Sample, "start at once")
     if not trips:
         return not_tried(NOT_KNOWN)
     if not samples:

@@ -13,7 +13,7 @@ from cube_tensor_driver.core.calibration import Calibration, illustrative
 from cube_tensor_driver.core.errors import FitError
 from cube_tensor_driver.core.modes import SPACE
 from cube_tensor_driver.core.oscillator import TemperatureModel, pad_frequency
-from cube_tensor_driver.core.response import illustrative_coefficients, response
+from cube_tensor_driver.core.response import choose_illustrative_coefficients, response
 from cube_tensor_driver.core.symmetry import find_structure
 
 
@@ -26,7 +26,7 @@ class Bench:
         rng = np.random.default_rng(seed)
         self.base = illustrative(layout)
         self.structure = find_structure(self.base.layout, symmetry)
-        self.coefficients = illustrative_coefficients(self.structure)
+        self.coefficients = choose_illustrative_coefficients(self.structure)
         self.gain = 1 + 0.05 * rng.normal(size=self.base.layout.n_pads)
         for orbit in self.structure.pad_orbits:
             self.gain[orbit] /= self.gain[orbit].mean()

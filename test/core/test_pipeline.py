@@ -282,7 +282,7 @@ def test_the_temperature_model_is_taken_out():
     assert rows.status.tolist() == [0, TEMPERATURE, 0, 0]
     mixed = pipeline.process(samples(np.array([1, 0]), frequencies(c, states[:2])))
     assert mixed.status.tolist() == [0, TEMPERATURE]
-    factor = pipeline.unloaded_factor(np.array([0, 1]), np.array([40.0, 40.0]))
+    factor = pipeline.compute_unloaded_factor(np.array([0, 1]), np.array([40.0, 40.0]))
     np.testing.assert_allclose(factor, [model.factor([40.0])[0], np.ones(8)])
 
 

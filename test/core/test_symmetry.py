@@ -14,14 +14,14 @@ from cube_tensor_driver.core.layout import LAYOUTS, Layout, find_layout
 from cube_tensor_driver.core.modes import COMPONENTS, PAPER, PLANE, SPACE, to_matrix, to_voigt
 from cube_tensor_driver.core.response import (
     ILLUSTRATIVE_CUBE,
-    illustrative_coefficients,
+    choose_illustrative_coefficients,
     project,
     response,
 )
 from cube_tensor_driver.core.symmetry import (
     GENERATORS,
     Structure,
-    default_modes,
+    choose_default_modes,
     find_group,
     find_layout_group,
     find_structure,
@@ -66,7 +66,7 @@ def pad_action(layout: Layout, rotation: np.ndarray) -> np.ndarray:
 
 def count_by_characters(layout: Layout, symmetry: str) -> int:
     """Number of coefficients as the mean over the group of (pads kept) x (trace on modes)."""
-    modes, elements = default_modes(layout), find_layout_group(layout, symmetry)
+    modes, elements = choose_default_modes(layout), find_layout_group(layout, symmetry)
     total = sum(np.trace(pad_action(layout, r)) * np.trace(modes.action(r)) for r in elements)
     return round(total / len(elements))
 
@@ -307,19 +307,15 @@ def test_a_symmetry_that_the_layout_lacks_names_the_pad():
 
 def test_the_illustrative_responses_agree_with_each_other():
     whole = {"quad": "slab", "planar": "full", "cube": "full"}
-    a = {
-        n: response(
-            find_structure(LAYOUTS[n], g), illustrative_coefficients(find_structure(LAYOUTS[n], g))
-        )
-        for n, g in whole.items()
-    }
+    structures = {n: find_structure(LAYOUTS[n], g) for n, g in whole.items()}
+    a = {n: response(s, choose_illustrative_coefficients(s)) for n, s in structures.items()}
     np.testing.assert_array_equal(a["quad"], a["planar"][:4])
     plane_in_space = SPACE.state(PLANE.stress, PLANE.gradient).T
     np.testing.assert_allclose(a["cube"][:8] @ plane_in_space, a["planar"], atol=1e-15)
     for name, symmetry in (("planar", "mirrors"), ("cube", "slab"), ("cube", "none")):
         structure = find_structure(LAYOUTS[name], symmetry)
         np.testing.assert_allclose(
-            response(structure, illustrative_coefficients(structure)), a[name], atol=1e-15
+            response(structure, choose_illustrative_coefficients(structure)), a[name], atol=1e-15
         )
     # as many combinations as any response of this symmetry has: only yz_x, zx_y and xy_z stay
     # hidden
@@ -352,6 +348,9 @@ def test_every_component_has_its_place():
         "zz_y",
         "zz_z",
     )
-    assert default_modes(LAYOUTS["quad"]) is PLANE and default_modes(LAYOUTS["cube"]) is SPACE
+    assert (
+        choose_default_modes(LAYOUTS["quad"]) is PLANE
+        and choose_default_modes(LAYOUTS["cube"]) is SPACE
+    )
     assert set(GENERATORS) == {"full", "slab", "mirrors", "none"}
     np.testing.assert_array_equal(PAPER.components[4], [0, 0.5, 0, 0.5, 0, 0, 0, 0])

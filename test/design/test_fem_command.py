@@ -377,7 +377,7 @@ def test_every_output_is_asked_about_before_any_work(
 
 
 def test_too_little_memory_is_said_before_any_work(monkeypatch, capsys):
-    monkeypatch.setattr(memory, "available_memory", lambda: 1e8)
+    monkeypatch.setattr(memory, "find_available_memory", lambda: 1e8)
     monkeypatch.setattr("cube_tensor_design.fem.fem.make_solid", None)
     assert cli.main(["fem", "cube_slab"]) == 1
     assert re.search(

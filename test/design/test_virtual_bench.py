@@ -11,7 +11,7 @@ from cube_tensor_design.fem import body as bodies
 from cube_tensor_design.fem.body import Body
 from cube_tensor_design.paper import experiments as paper
 from cube_tensor_design.paper import virtual_bench as benches
-from cube_tensor_design.paper.experiments import dent, plates
+from cube_tensor_design.paper.experiments import make_dent_step, make_plate_step
 from cube_tensor_design.paper.material import Material
 from cube_tensor_design.paper.normal_fall import normal_fall
 from cube_tensor_design.paper.rod import Rod
@@ -59,7 +59,9 @@ def test_stress_and_moduli_are_derivatives_of_the_energy(finite):
 
 @pytest.mark.parametrize("finite", [False, True])
 def test_sliding_plates_without_a_cube_press_evenly(finite):
-    result = VirtualBench(BODY, cube=False, finite=finite).run([plates(BODY, 2e-3, bonded=False)])
+    result = VirtualBench(BODY, cube=False, finite=finite).run(
+        [make_plate_step(BODY, 2e-3, bonded=False)]
+    )
     strain = 2e-3 / BODY.height
     linear = -strain * BODY.young / (1 - BODY.poisson**2)
     exact = uniaxial(1 - strain, BODY.young, BODY.poisson) if finite else linear
@@ -71,7 +73,7 @@ def test_sliding_plates_without_a_cube_press_evenly(finite):
 
 
 def test_finite_strain_is_linear_for_small_loads(coarse):
-    step = [plates(BODY, 1e-6), plates(BODY, 1e-6, 1e-6)]
+    step = [make_plate_step(BODY, 1e-6), make_plate_step(BODY, 1e-6, 1e-6)]
     linear, finite = (
         VirtualBench(BODY, finite=finite, size=2.0).run(step).pads[1] for finite in (False, True)
     )
@@ -84,7 +86,7 @@ def test_pads_converge_with_the_mesh_at_the_cube(monkeypatch):
 
     0.3 % is allowed and 0.13 % found; where they are not cut at all it is 2.1 %.
     """
-    step, found = [plates(BODY, 3e-3, 3e-3)], []
+    step, found = [make_plate_step(BODY, 3e-3, 3e-3)], []
     for more in (0, 1):
         monkeypatch.setattr(benches, "CUBE_REFINEMENTS", benches.CUBE_REFINEMENTS + more)
         found.append(VirtualBench(BODY).run(step).pads[0, :4] @ [-1, 1, 1, -1])
@@ -93,7 +95,10 @@ def test_pads_converge_with_the_mesh_at_the_cube(monkeypatch):
 
 def test_plates_that_grip_shear_the_body_as_it_stands():
     """Without a cube, a small shear s adds mu s / h in the middle of an evenly pressed block."""
-    steps = [plates(BODY, 2e-3, bonded=False), plates(BODY, 2e-3, 0.1e-3, gripped=True)]
+    steps = [
+        make_plate_step(BODY, 2e-3, bonded=False),
+        make_plate_step(BODY, 2e-3, 0.1e-3, gripped=True),
+    ]
     state = VirtualBench(BODY, cube=False).run(steps).state
     shear = -BODY.young / (2 * (1 + BODY.poisson)) * 0.1e-3 / BODY.height
     assert state[1, :2] == pytest.approx([state[0, 0], shear], rel=1e-3)
@@ -104,7 +109,7 @@ def test_too_large_a_load_is_refused(coarse, monkeypatch):
     # Each further halving doubles the time until it gives up.
     monkeypatch.setattr(benches, "STEP_HALVINGS", 1)
     with pytest.raises(ElasticError, match="too large even in 2 parts; press less"):
-        VirtualBench(BODY, finite=True, size=2.0).run([plates(BODY, 12e-3)])
+        VirtualBench(BODY, finite=True, size=2.0).run([make_plate_step(BODY, 12e-3)])
 
 
 # the rod
@@ -121,9 +126,9 @@ def test_a_round_rod_presses_as_hertz_says():
     radius = 50e-3
     bench = VirtualBench(body, cube=False, size=1.0)
     rod = Rod(1e-3, 0.0, 2 * radius, radius)
-    u, basis = bench.solve(dent(body, rod)), bench.section.basis
+    u, basis = bench.solve(make_dent_step(body, rod)), bench.section.basis
     vertical = np.concatenate([basis.nodal_dofs[1], basis.facet_dofs[1]])
-    force = 5e-3 * bench.rod_contact(rod).force(u)[vertical]
+    force = 5e-3 * bench.make_rod_contact(rod).force(u)[vertical]
     square = force @ (5e-3 * basis.doflocs[0, vertical]) ** 2 / force.sum()
     assert 4e-3 < 2 * np.sqrt(square) < 7e-3
     assert force.sum() == pytest.approx(
@@ -134,7 +139,7 @@ def test_a_round_rod_presses_as_hertz_says():
 @pytest.mark.parametrize("finite", [False, True])
 def test_the_rods_force_and_tangent_are_derivatives_of_its_energy(coarse, finite):
     bench = VirtualBench(BODY, finite=finite, size=1.0)
-    contact = bench.rod_contact(Rod(0.5e-3, 1e-3))
+    contact = bench.make_rod_contact(Rod(0.5e-3, 1e-3))
     random = np.random.default_rng(8)
     u, du = 0.05 * random.normal(size=(2, bench.section.basis.N))
     h = 1e-6
@@ -154,7 +159,7 @@ def test_a_deep_rod_folds_no_element(coarse, bonded, last):
     equilibrium on one processor, with a P_shear that differs by 0.36 %.
     """
     depths = (0.5e-3, 1e-3, 1.5e-3, 2e-3, *last)
-    steps = [dent(BODY, Rod(depth, 1e-3), bonded) for depth in depths]
+    steps = [make_dent_step(BODY, Rod(depth, 1e-3), bonded) for depth in depths]
     coarse, fine = (
         VirtualBench(BODY, finite=True, size=size).run(some).pads[:, :4] @ [-1, 1, 1, -1]
         for size, some in ((2.0, steps), (1.4, steps[:2]))
@@ -169,7 +174,7 @@ def test_a_deep_rod_folds_no_element(coarse, bonded, last):
 def test_a_sliding_bottom_stays_on_average(coarse, finite):
     """What keeps it there is spread evenly: each node has a force in proportion to its length."""
     bench, rod = VirtualBench(BODY, finite=finite, size=1.0), Rod(0.3e-3, 1e-3)
-    u = bench.solve(dent(BODY, rod, bonded=False))
+    u = bench.solve(make_dent_step(BODY, rod, bonded=False))
     weights = bottom_weights(bench.section.basis)
     assert abs(weights @ u) < 1e-9 * np.abs(weights).max() * np.abs(u).max()
     left, along_x = unbalanced_forces(bench, u, rod), bench.section.component == 0
@@ -181,7 +186,7 @@ def test_a_sliding_bottom_stays_on_average(coarse, finite):
 
 def unbalanced_forces(bench, u, rod):
     """Nodal forces (dofs,) on the body at u, which plates must hold."""
-    return bench._balance(u, bench.rod_contact(rod)).force
+    return bench._balance(u, bench.make_rod_contact(rod)).force
 
 
 def bottom_weights(basis, along=0):
@@ -216,7 +221,7 @@ def test_the_prototypes_readings_are_sums_of_the_response():
 
 
 def experiment(pads, truth, rotation):
-    frequency = paper.foam_frequency(pads[:, :4])
+    frequency = paper.compute_foam_frequency(pads[:, :4])
     signals = paper.prototype(frequency)
     steps = np.arange(float(len(pads)))
     return paper.Experiment("b", steps, pads, signals, truth, truth, rotation)
@@ -236,7 +241,7 @@ def test_a_body_that_is_turned_as_a_whole_has_parts_that_sum_to_nothing(coarse):
     """The true s_zz changes and no pad feels it: what turned faces bring makes up for it."""
     angle = 0.15
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    pressed = plates(NARROW, 1e-3, 1e-3)
+    pressed = make_plate_step(NARROW, 1e-3, 1e-3)
 
     def turned(x):
         moved = pressed.prescribed(x)
@@ -257,8 +262,8 @@ def test_a_body_that_is_turned_as_a_whole_has_parts_that_sum_to_nothing(coarse):
 
 def test_a_rod_above_c2_raises_p_shear_only_with_c2_on_the_lower_face(coarse):
     """C2's side is x > 0 on either face; P_grad rises with both, as in the paper's Fig. 8 (c)."""
-    pads = VirtualBench(NARROW, size=2.0).run([dent(NARROW, Rod(1e-3, 1e-3))]).pads
-    frequency = paper.foam_frequency(pads)
+    pads = VirtualBench(NARROW, size=2.0).run([make_dent_step(NARROW, Rod(1e-3, 1e-3))]).pads
+    frequency = paper.compute_foam_frequency(pads)
     lower, upper = (paper.prototype(frequency[:, face])[0] for face in (paper.ON_LOWER, slice(4)))
     assert lower.min() > 0
     assert upper == pytest.approx(lower * [1, -1, 1])
@@ -268,7 +273,7 @@ def test_the_parts_under_a_rod_sum_to_the_signal_of_the_bench(coarse):
     """The parts know the field without the cube alone; a rod above the middle gives none."""
     bench = VirtualBench(NARROW, size=1.0)
     signal = P_SHEAR @ bench.pad_weights(bench.layout)
-    middle, beside = (dent(NARROW, Rod(1e-3, place)) for place in (0.0, 2e-3))
+    middle, beside = (make_dent_step(NARROW, Rod(1e-3, place)) for place in (0.0, 2e-3))
     none, parts = (split_signals(bench, step, [signal])[0] for step in (middle, beside))
     assert parts.sum() == pytest.approx(P_SHEAR @ bench.run([beside]).pads[0], rel=1e-6)
     assert np.abs(none).max() < 1e-6 * np.abs(parts).max()
@@ -277,14 +282,14 @@ def test_the_parts_under_a_rod_sum_to_the_signal_of_the_bench(coarse):
 def test_the_parts_sum_to_the_signal_of_a_rod_with_the_force_it_has_without_the_cube(coarse):
     """The force is what the bottom bears."""
     bench = VirtualBench(Body(width=12e-3), size=2.0)
-    step = dent(bench.body, Rod(1e-3, 1e-3, edge_radius=1e-5))  # sharp: soon solved
+    step = make_dent_step(bench.body, Rod(1e-3, 1e-3, edge_radius=1e-5))  # sharp: soon solved
     drawn_back, bottom = draw_back(bench, step), bottom_weights(bench.section.basis, along=1) > 0
     signal = P_SHEAR @ bench.pad_weights(bench.layout)
     parts = split_signals(bench, step, [signal], "force")[0]
     assert parts.sum() == pytest.approx(P_SHEAR @ bench.run([drawn_back]).pads[0], rel=1e-6)
     force, without = (
         unbalanced_forces(body, body.solve(one), one.rod)[bottom].sum()
-        for body, one in ((bench, drawn_back), (bench.without_cube(), step))
+        for body, one in ((bench, drawn_back), (bench.remove_cube(), step))
     )
     assert force == pytest.approx(without, rel=1e-6)
     assert drawn_back.rod.pressed < 0.8e-3
@@ -328,8 +333,8 @@ def test_study_error_falls_with_the_square_of_the_side(monkeypatch):
         assert error[0, 0, zz] < 0.06 and error[0, 0, slope] < 0.06
     coarse, fine = result.error["cube"][:, 0, zz]
     assert np.log2(coarse / fine) == pytest.approx(2, abs=0.3)
-    assert result.trusted_widths("cube")[0, zz] == 5e-3
-    assert np.isnan(result.trusted_widths("quad")[0, COMPONENTS.index("yy")])
+    assert result.find_trusted_widths("cube")[0, zz] == 5e-3
+    assert np.isnan(result.find_trusted_widths("quad")[0, COMPONENTS.index("yy")])
     assert np.isnan(result.error["quad"][0, 0, COMPONENTS.index("yy")])
 
 

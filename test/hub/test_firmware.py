@@ -35,9 +35,9 @@ from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import skin_processes
 from cube_tensor_driver.simulation.cubes import compute_skin_components, make_hub_cubes
 from cube_tensor_driver.simulation.load import Load, default_script
-from cube_tensor_hub.captures import COUNTER_HZ, WINDOW_US, Oscillators, edges
+from cube_tensor_hub.captures import COUNTER_HZ, WINDOW_US, Oscillators, find_edges
 from cube_tensor_hub.check import Checked, check
-from cube_tensor_hub.firmware import Emulator, FirmwareError, build, missing, need
+from cube_tensor_hub.firmware import Emulator, FirmwareError, build, find_missing, need
 from cube_tensor_hub.port_wire import PortWire
 from cube_tensor_hub.rule import Outcome
 from cube_tensor_hub.transcript import FrameListener
@@ -45,7 +45,10 @@ from cube_tensor_hub.transcript import FrameListener
 SOURCE = ROOT / "firmware"
 SKIN = package_data() / "config" / "skin_firmware.yaml"
 OF_PERIODS = {"H1", "R3", "R6", "R7"}
-NO_CC, NO_ARM = missing("make", "cc"), missing("make", "arm-none-eabi-gcc", "qemu-system-arm")
+NO_CC, NO_ARM = (
+    find_missing("make", "cc"),
+    find_missing("make", "arm-none-eabi-gcc", "qemu-system-arm"),
+)
 
 pytestmark = pytest.mark.skipif(bool(NO_CC), reason=NO_CC)
 emulated = pytest.mark.skipif(bool(NO_ARM), reason=NO_ARM)
@@ -128,7 +131,7 @@ def test_a_ring_needs_no_lock(tmp_path):
 def test_captures_are_those_of_the_oscillators():
     """To the tick; a pad without two edges in the window has none."""
     millihertz = np.array([100_000_000, 0, 399_000, 3_000_000_000], np.uint32)
-    found = edges(millihertz, np.array([0.25, 0.5, 0.5, 0.0]))
+    found = find_edges(millihertz, np.array([0.25, 0.5, 0.5, 0.0]))
     ticks = [COUNTER_HZ * 1e3 / f for f in (1e8, 3e9)]
     assert found["periods"].tolist() == [249, 0, 0, 7499]
     assert found["first"].tolist() == [int(0.25 * ticks[0]), 0, 0, 0]

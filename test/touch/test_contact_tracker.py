@@ -135,7 +135,7 @@ def test_the_noise_of_a_cube_is_how_its_values_scatter_with_the_gains_and_the_co
     bench, random = TractionBench(Setting(cubes=cubes), side=1), np.random.default_rng(7)
     field = bench.truth(np.array([[1e-3, 2e-3]]), 2e-3, np.array([0.6, 0.3, -3.0]), np.zeros(2))
     count = len(bench.poses.position)
-    pads = bench.pads_in(np.repeat(field, count, axis=0))
+    pads = bench.compute_pads_in(np.repeat(field, count, axis=0))
     drawn = [bench.inverse.scaled(bench.measured(pads, random)) for _ in range(12)]
     noise = CubeNoise(bench.inverse)
     noise.update(drawn[0], np.arange(count))
@@ -155,7 +155,7 @@ def test_where_nothing_is_left_the_field_is_as_unsure_as_noise_and_gains_make_it
     bench, random = TractionBench(Setting(), side=2), np.random.default_rng(3)
     inverse, force = bench.inverse, np.array([0.6, 0.3, -3.0])
     field = bench.truth(bench.poses.position[:, :2], 8e-3, force, np.array([1e-3, 2e-3]))
-    pads = bench.pads_in(field)
+    pads = bench.compute_pads_in(field)
     drawn = np.stack([inverse.scaled(bench.measured(pads, random)) for _ in range(100)])
     drawn[:, lost] = np.nan
     middle = drawn.mean(axis=0)

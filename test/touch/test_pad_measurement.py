@@ -140,7 +140,7 @@ def test_pads_that_are_left_out_change_what_a_cube_says_and_the_contact_stays(
     settings = ContactSettings(method="inverse", influence="cube_11mm")
     n = len(bench.poses.position)
     finder = contact_finder(settings, bench.poses, [calibration] * n)
-    pads, left_out = bench.pads_under(5e-3, load, centre), np.zeros(n, np.uint32)
+    pads, left_out = bench.compute_pads_under(5e-3, load, centre), np.zeros(n, np.uint32)
     near = np.argsort(np.linalg.norm(bench.poses.position[:, :2] - centre, axis=1))[:4]
     for bits in (0, [1, 2, 4, 8], [3, 0, 8, 0], 0):
         left_out[near] = bits
@@ -156,7 +156,7 @@ def test_in_the_field_a_cube_without_a_pad_counts_as_missing(influence):
     setting = Setting(depth=influence.depth, thickness=11e-3, known_thickness=11e-3)
     bench, random = LayerBench(setting, influence, influence, side=1), np.random.default_rng(5)
     inverse, n = bench.inverse, len(bench.poses.position)
-    pads = bench.pads_under(5e-3, np.array([0.6, 0.3, -3.0]), np.array([1e-3, -2e-3]))
+    pads = bench.compute_pads_under(5e-3, np.array([0.6, 0.3, -3.0]), np.array([1e-3, -2e-3]))
     values, pipeline = bench.measured(pads, random), Pipeline([CUBE] * n)
     cube, lost = np.array([n // 2]), values.copy()
     lost[cube] = np.nan

@@ -144,7 +144,7 @@ def test_a_body_that_is_shaken_and_sticks_does_not_slip(benches, body, largest):
             # Pressure of a tilted punch, p0 (1 + 3 x e / a^2) / sqrt(1 - r^2 / a^2).
             arm = sources[:, :2] - [1e-3, 2e-3]
             forces[:, 2] *= 1 + 3 * lever * (arm @ ratio) / body.size**2
-        pads.append(skin.pads_under((sources, forces)))
+        pads.append(skin.compute_pads_under((sources, forces)))
     run = Run(benches[0], skin.measure(np.array(pads)))
     assert not run.begun and SLIP not in run.states
     assert run.states.count(STICK) > 40

@@ -42,9 +42,9 @@ def test_a_study_ranks_the_kinds_of_cubes_and_counts_those_that_are_saved():
     alone, whole, planar = np.moveaxis(study.error[0], 1, 0)
     assert (whole < planar).all() and (planar < alone).all()
     assert (whole < 0.2).all() and (alone > 2 * whole).all()
-    ((one, saved, some),) = study.cubes_saved(0.14)
+    ((one, saved, some),) = study.compute_cubes_saved(0.14)
     assert one == 1 and 1 < some < saved
-    assert np.isnan(study.cubes_saved(0.9)).all()
+    assert np.isnan(study.compute_cubes_saved(0.9)).all()
 
 
 def test_value_and_gradient_are_met_at_the_cubes():

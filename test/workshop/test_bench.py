@@ -14,7 +14,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 
-from cube_tensor_hub.firmware import missing
+from cube_tensor_hub.firmware import find_missing
 from workshop.bench import skin as bench
 
 KEYS = {
@@ -39,7 +39,7 @@ KEYS = {
 
 
 @pytest.mark.alone
-@pytest.mark.skipif(bool(missing("make", "cc")), reason=missing("make", "cc"))
+@pytest.mark.skipif(bool(find_missing("make", "cc")), reason=find_missing("make", "cc"))
 def test_skin_counts_what_was_sent(domain, tmp_path):
     """In batches of two: the first row of each waits a period, 10 ms, for the second."""
     path = tmp_path / "figures.json"
@@ -85,7 +85,7 @@ def test_growth_of_memory():
 
 
 @pytest.mark.alone
-@pytest.mark.skipif(bool(missing("make", "cc")), reason=missing("make", "cc"))
+@pytest.mark.skipif(bool(find_missing("make", "cc")), reason=find_missing("make", "cc"))
 def test_links_counts_what_hubs_in_c_sent(tmp_path):
     figures = tmp_path / "figures.json"
     command = [sys.executable, "-c", LINKS, figures]

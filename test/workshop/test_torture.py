@@ -19,7 +19,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 
 from cube_tensor_driver.processes import domain
 from workshop.torture.mutations import MUTATIONS, edit_source
-from workshop.torture.torture import LIMITS, failures
+from workshop.torture.torture import LIMITS, find_failures
 
 
 def run(tmp_path, *arguments, seconds):
@@ -48,7 +48,7 @@ def test_a_tortured_skin_loses_nothing_uncounted_and_says_nothing_wrong(tmp_path
     result, output = run(tmp_path, "--duration", str(duration), "--seed", "1", seconds=150 * effort)
     # In 10 s one stall of a busy machine is a tenth of the stamps: only longer runs check the tail.
     tail = {"stamp_error_p90_ms", "stamp_error_p99_ms"} if effort == 1 else set()
-    assert set(failures(result)) <= tail, output
+    assert set(find_failures(result)) <= tail, output
     assert result["samples_sent"] > 32 * 300 * duration and result["counted"] > 0
     assert result["faults_to_flag"] >= 3 and result["actions"]["tare"]
 
@@ -58,8 +58,8 @@ def test_a_mutation_is_caught_in_a_short_torture():
     """The frequencies are 1 ppm too high."""
     code = (
         "import threading\n"
-        "from workshop.torture.torture import failures, torture\n"
-        "print(*failures(torture(2.0, 1, threading.Event(), 'scaled')))"
+        "from workshop.torture.torture import find_failures, torture\n"
+        "print(*find_failures(torture(2.0, 1, threading.Event(), 'scaled')))"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=120
@@ -113,9 +113,9 @@ def test_a_torture_has_a_domain_of_its_own(monkeypatch):
 
 def test_limits_of_the_figures():
     good = dict.fromkeys(LIMITS, 0)
-    assert failures(good) == []
-    assert failures({**good, "lost": 1, "stamp_error_p50_ms": 0.8}) == [
+    assert find_failures(good) == []
+    assert find_failures({**good, "lost": 1, "stamp_error_p50_ms": 0.8}) == [
         "lost",
         "stamp_error_p50_ms",
     ]
-    assert failures({**good, "rss_slope_mb_per_min": None}) == []
+    assert find_failures({**good, "rss_slope_mb_per_min": None}) == []

@@ -194,7 +194,7 @@ def _compute_pads_under(
     load = place, forces[:, 2:] * force
     depth = bench.setting.depth * (1 + depth_error)
     poisson = min(bench.setting.poisson + poisson_error, 0.5)
-    return bench.pads_in(compute_field_below(bench.poses.position, depth, load, poisson))
+    return bench.compute_pads_in(compute_field_below(bench.poses.position, depth, load, poisson))
 
 
 def bench_shapes(loads: int) -> TrackingResults:

@@ -38,7 +38,7 @@ from cube_tensor_driver.ros.qos import batch_profile
 from cube_tensor_driver.simulation.sample_log import SampleTable
 from cube_tensor_driver.views.figures.style import save
 
-from ..torture.memory import median_slope
+from ..torture.memory import compute_median_slope
 from .hub_arrivals import HubArrivals
 from .hubs_in_c import HubLoad, read_samples
 from .scale import draw_scale
@@ -392,5 +392,5 @@ def summarise_memory(memory_mb: dict[str, list[float]]) -> dict[str, float]:
     if times_s[-1] + MEMORY_PERIOD_S < MIN_GROWTH_DURATION_S:
         return result
     begin = len(times_s) // 5
-    slopes = [median_slope(times_s[begin:], values[begin:]) for values in nodes]
+    slopes = [compute_median_slope(times_s[begin:], values[begin:]) for values in nodes]
     return result | {"rss_mb_per_minute": round(60 * max(slopes), 3)}

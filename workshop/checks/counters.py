@@ -91,7 +91,7 @@ def _is_between_drivers(run: Run) -> Mask:
     """
     samples, sent_ns = run.samples, run.record.frequencies.sent_ns
     between = np.zeros(len(samples), bool)
-    for action in run.record.actions_of(*DRIVER_KILLS):
+    for action in run.record.select_actions(*DRIVER_KILLS):
         later = find_matched(run.sample)
         arrived = run.sample[later[sent_ns[later] > action.begin_ns]]
         # Rows that were sampled before the kill came from the killed driver, although late.

@@ -102,7 +102,7 @@ def check_health(run: Run, sample: Index) -> Findings:
         pad = fault.fault.pad
         bit = STATUS_OF_FAULT[fault.kind]
         mine = np.flatnonzero(rows.cube == fault.cube)
-        permitted = evidence.flagged_span(fault)
+        permitted = evidence.find_flagged_span(fault)
         may_be_flagged = mine[permitted.contains(time_ns[mine])]
         permitted_pads[may_be_flagged] |= np.uint32(1 << pad)
         permitted_status[may_be_flagged] |= np.uint16(bit | PERMITTED_STATUS)
@@ -154,10 +154,10 @@ class _Evidence:
         for calibration in run.record.skin.calibrations:
             self._noise.append(calibration.rest_frequency * frequency_noise(calibration))
 
-    def flagged_span(self, fault: HubFault) -> Span:
+    def find_flagged_span(self, fault: HubFault) -> Span:
         """Return the span of time in which the pad of a fault may be flagged."""
         end_ns = fault.end_ns + round(NS_PER_S * RELEASE_S)
-        for action in self._run.record.actions_of(*DRIVER_KILLS):
+        for action in self._run.record.select_actions(*DRIVER_KILLS):
             # No rows arrive while there is no driver, so the pad is released later.
             if fault.begin_ns < action.end_ns and action.begin_ns < end_ns:
                 end_ns += action.end_ns - action.begin_ns
@@ -182,7 +182,7 @@ class _Evidence:
         """Return whether the statistics of the pads were disturbed in a span of time: by a cut of
         any link, or by the start of a node."""
         cuts = self._run.samples.faults(*CUT_FAULTS)
-        starts = self._run.record.actions_of(*NODE_STARTS)
+        starts = self._run.record.select_actions(*NODE_STARTS)
         is_cut = any(cut.overlaps(span, DISTURBANCE_S) for cut in cuts)
         return is_cut or any(start.overlaps(span, RESTART_S) for start in starts)
 

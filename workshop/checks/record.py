@@ -296,7 +296,7 @@ class Record(Span):
     counters: Mapping[str, int]
     messages_lost: int
 
-    def actions_of(self, *kinds: str) -> list[NodeAction]:
+    def select_actions(self, *kinds: str) -> list[NodeAction]:
         """Return the actions of the given kinds, in the order of time."""
         return [action for action in self.actions if action.kind in kinds]
 
@@ -310,6 +310,6 @@ class Record(Span):
         """Find the times (N,) within actions of some kinds, or less than a margin before or after
         one."""
         during = np.zeros(len(time_ns), bool)
-        for action in self.actions_of(*kinds):
+        for action in self.select_actions(*kinds):
             during |= action.contains(time_ns, before_s, after_s)
         return during

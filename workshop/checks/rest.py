@@ -86,7 +86,7 @@ class RestHistory:
             self._epochs.append((following, current))
 
     def _find_changes(self) -> list[NodeAction]:
-        actions = self._run.record.actions_of("tare", "clear")
+        actions = self._run.record.select_actions("tare", "clear")
         return [action for action in actions if action.succeeded]
 
     def _apply(self, action: NodeAction, current: RestFrequencies) -> RestFrequencies:
@@ -99,7 +99,7 @@ class RestHistory:
         held = self._run.sent.find_held(cubes, averaged)
         return current.tare(cubes, held)
 
-    def candidates(
+    def select_candidates(
         self,
         sent_ns: Times,
     ) -> Iterator[tuple[Mask, RestFrequencies]]:

@@ -92,7 +92,7 @@ def check_tensors(run: Run) -> TensorFindings:
         sent_ns = record.stress.sent_ns[part]
         agrees = np.zeros(len(part), bool)
         # Around a change of the rest frequencies, a row may be made with the old or the new ones.
-        for is_candidate, rest in history.candidates(sent_ns):
+        for is_candidate, rest in history.select_candidates(sent_ns):
             has_no_reference = ~rest.is_known[made.cube]
             is_right = reference.agrees(made, measured, rest)
             agrees |= is_candidate & (has_no_reference | is_right)
@@ -139,7 +139,7 @@ def _find_missing(run: Run, has_tensor: Mask) -> Mask:
     stamp_ns, sent_ns = record.frequencies.rows.stamp_ns, record.frequencies.sent_ns
     is_missing = ~has_tensor & record.contains(stamp_ns)
     is_missing &= ~record.stress.is_in_gap(stamp_ns)
-    for action in record.actions_of(*NODE_STARTS):
+    for action in record.select_actions(*NODE_STARTS):
         was_up = has_tensor & (sent_ns <= action.begin_ns)
         before_ns = sent_ns[was_up].max(initial=0)
         is_missing &= (sent_ns <= before_ns) | (sent_ns > action.end_ns)

@@ -82,12 +82,12 @@ def measure_reconnects(run: Run, frequencies: FrequencyFindings) -> list[float]:
 def count_wrong_periods(run: Run) -> int:
     """Count the hubs that did not sample at the rate that was asked for, over all changes."""
     record, samples = run.record, run.samples
-    disturbing = record.actions_of("rate", *DRIVER_STOPS)
+    disturbing = record.select_actions("rate", *DRIVER_STOPS)
     disturbances = [action.begin_ns for action in disturbing]
     disturbances.append(record.end_ns)
     cuts = samples.faults(*CUT_FAULTS)
     wrong = 0
-    for action in record.actions_of("rate"):
+    for action in record.select_actions("rate"):
         settled = Span(action.end_ns, action.end_ns + round(NS_PER_S * RATE_CHANGE_S))
         # A later change within this time would have changed the period again.
         is_disturbed = settled.contains(np.array(disturbances)).any()

@@ -63,7 +63,7 @@ def write_contact_tables(
         true_pads: True influence functions of the pads in a layer.
         shapes: Results of loads of each shape.
     """
-    tables = contact_tables(true_pads)
+    tables = compute_contact_tables(true_pads)
     tables["shapes"] = {
         "loads in each row": max(map(len, shapes.values())),
         "scans of each load": SCANS,
@@ -75,7 +75,7 @@ def write_contact_tables(
     write_json(path, tables)
 
 
-def contact_tables(true_pads: Influence) -> dict[str, Any]:
+def compute_contact_tables(true_pads: Influence) -> dict[str, Any]:
     """Run the studies and return their tables by name: 3 N press and 0.9 N rub."""
     balls = traction_study((*MAIN, *PITCHES), WIDTHS, BALL_LOADS, SEED)
     by_pitch = {

@@ -21,7 +21,7 @@ from cube_tensor_design.figures.pads_example import draw_pads, draw_sweep
 from cube_tensor_design.paper.experiments import experiments
 from cube_tensor_design.studies.field_study import compute_field_example, field_study
 from cube_tensor_design.studies.pads_example import read_planar_calibration, sweep
-from cube_tensor_design.studies.pads_study import coarse_influence, layer_example
+from cube_tensor_design.studies.pads_study import compute_coarse_influence, compute_layer_example
 from cube_tensor_design.studies.traction_study import compute_traction_example
 from cube_tensor_driver.config.output_files import write_json
 from cube_tensor_driver.config.package_data import package_data
@@ -109,13 +109,14 @@ def make_pictures(folder: Path) -> None:
     study = field_study()
     save(draw_field_study(study), folder / "field_error.png")
     saved = {
-        f"cubes saved at an error of {level}": study.cubes_saved(level) for level in ERROR_LEVELS
+        f"cubes saved at an error of {level}": study.compute_cubes_saved(level)
+        for level in ERROR_LEVELS
     }
     write_json(folder / "field.json", vars(study) | saved)
     save(draw_traction(compute_traction_example()), folder / "traction.png")
-    true_pads = coarse_influence()
+    true_pads = compute_coarse_influence()
     save(
-        draw_methods(layer_example(true_pads), "cubes as "),
+        draw_methods(compute_layer_example(true_pads), "cubes as "),
         folder / "thin_layer.png",
     )
     shapes = bench_shapes(SHAPE_LOADS)

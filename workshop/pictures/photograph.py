@@ -66,7 +66,7 @@ When it presses for the second time, the plots of 10 s are full.
 
 
 @contextmanager
-def chromium(url: str) -> Iterator[webdriver.Chrome]:
+def open_chromium(url: str) -> Iterator[webdriver.Chrome]:
     """Open the page in a headless browser."""
     options = webdriver.ChromeOptions()
     options.binary_location = shutil.which("chromium") or shutil.which("google-chrome") or ""
@@ -83,7 +83,7 @@ def chromium(url: str) -> Iterator[webdriver.Chrome]:
 
 def photograph(url: str, path: Path) -> None:
     """Write a picture of the page at a URL to a PNG file."""
-    with chromium(url) as browser:
+    with open_chromium(url) as browser:
         wait = WebDriverWait(browser, MAX_WAIT_S, poll_frequency=POLL_S)
         wait.until(lambda _: browser.execute_script(READY))
         browser.execute_script(CLOSE_NOTES)

@@ -198,7 +198,7 @@ class Actions:
         while True:
             # A tare that is refused changes nothing, so only the last request counts.
             self._begin_ns = time.time_ns()
-            age_ns = self._begin_ns - int(self._stress.newest_rows().stamp_ns[-1])
+            age_ns = self._begin_ns - int(self._stress.decode_newest_rows().stamp_ns[-1])
             self._is_late |= age_ns > NS_PER_S * MAX_STRESS_AGE_S
             succeeded, answer = self._call(self._tare, request)
             if succeeded or time.monotonic() > until_s:

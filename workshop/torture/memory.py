@@ -52,20 +52,20 @@ class MemoryMonitor:
         ids = {name: self._children.pid(name) for name in self._names}
         return {name: psutil.Process(pid).num_threads() for name, pid in ids.items()}
 
-    def growth_mb_per_min(self) -> float | None:
+    def compute_growth_mb_per_min(self) -> float | None:
         """Return the growth of the process that grows fastest, None if no process ran long enough.
 
-        See `median_slope`."""
+        See `compute_median_slope`."""
         slopes = []
         for sizes in self._sizes.values():
             times_s, sizes_mb = np.array(sizes).T
             settled = times_s > times_s[0] + SETTLE_S
             if times_s[-1] - times_s[0] >= SETTLE_S + MIN_DURATION_S:
-                slopes.append(median_slope(times_s[settled], sizes_mb[settled]))
+                slopes.append(compute_median_slope(times_s[settled], sizes_mb[settled]))
         return round(60 * max(slopes), 2) if slopes else None
 
 
-def median_slope(x: Array, y: Array) -> float:
+def compute_median_slope(x: Array, y: Array) -> float:
     """Return the median of the slopes dy/dx between all pairs of points (Theil, Sen), which a
     single step does not change."""
     later, earlier = np.tril_indices(len(x), -1)

@@ -35,7 +35,7 @@ from .hubs import READINGS
 from .memory import MemoryMonitor
 from .mix import CUBES_PER_HUB, HUBS, PADS, RATE, schedule
 from .mutations import apply_mutation
-from .recorder import recording
+from .recorder import record_torture
 
 CUBES_PER_ROW = 8
 """Number of cubes side by side on the tortured skin."""
@@ -104,7 +104,7 @@ def play(
         for process in processes.values():
             children.start(process)
         memory = MemoryMonitor(children, NODES)
-        with recording(skin, children, interrupted, memory) as recorder:
+        with record_torture(skin, children, interrupted, memory) as recorder:
             observer, stress = recorder.observer, recorder.stress
             actions = Actions(
                 observer, children, processes, skin, stress, recorder.on_driver_killed
@@ -114,7 +114,7 @@ def play(
             # Faults begin only when every cube delivers.
             observer.spin(
                 MAX_START_S,
-                lambda: stress.count > 0 and len(stress.newest_rows()) == len(skin.cubes),
+                lambda: stress.count > 0 and len(stress.decode_newest_rows()) == len(skin.cubes),
             )
             if not stress.count:
                 logs = "\n".join(children.log(name)[-500:] for name in NODES)
@@ -129,7 +129,7 @@ def play(
             observer.spin(ARRIVAL_S)
             leaked = Counter(memory.count_threads())
             leaked.subtract(threads)
-            growth = memory.growth_mb_per_min()
+            growth = memory.compute_growth_mb_per_min()
 
             # Once it is deactivated, the driver still reports the final counters.
             stopped_ns = time.time_ns()

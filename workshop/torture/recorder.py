@@ -139,7 +139,7 @@ class TopicLog(Generic[AnyRows]):
         self.take()
         self._last_number = 0
 
-    def newest_rows(self) -> AnyRows:
+    def decode_newest_rows(self) -> AnyRows:
         """Return the rows of the newest message; there must be one."""
         return self._codec.decode(self._messages[-1].data).rows
 
@@ -154,7 +154,7 @@ class TopicLog(Generic[AnyRows]):
         sent_ns = np.array([message.sent_ns for message in self._messages])
         n_rows: list[int] = []
         unreadable = 0
-        for _, group in groupby(enumerate(self._messages), self._batch_of):
+        for _, group in groupby(enumerate(self._messages), self._find_batch):
             messages = [message.data for _, message in group]
             data = np.frombuffer(b"".join(messages), np.uint8)
             try:
@@ -175,7 +175,7 @@ class TopicLog(Generic[AnyRows]):
         gaps = tuple((first_row[before], missing) for before, missing in self._gaps)
         return Received(concatenate(decoded), np.repeat(sent_ns, n_rows), gaps, unreadable)
 
-    def _batch_of(self, item: tuple[int, Message]) -> tuple[int, int, bytes]:
+    def _find_batch(self, item: tuple[int, Message]) -> tuple[int, int, bytes]:
         """Return what successive messages that are decoded together have in common."""
         number, message = item
         shape = self._codec.shape_bytes(message.data)
@@ -295,7 +295,7 @@ class TortureRecorder:
 
 
 @contextmanager
-def recording(
+def record_torture(
     skin: Skin,
     children: Children,
     interrupted: Event,

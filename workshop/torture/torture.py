@@ -87,7 +87,7 @@ def run_torture(
     """
     result = torture(duration, seed, stop_event())
     report(result, json_path)
-    broken = failures(result)
+    broken = find_failures(result)
     if broken:
         print(f"above their limits: {', '.join(broken)}")
     return 1 if broken else 0
@@ -129,7 +129,7 @@ def run_mutations(
             # delivered nothing to it any more, each time it was tried.
             with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
                 figures = process.submit(_torture_mutated, name, seed).result()
-            found_by, seconds = failures(figures), figures["seconds"]
+            found_by, seconds = find_failures(figures), figures["seconds"]
             results[name] = {
                 "caught": bool(found_by),
                 "by": found_by,
@@ -150,7 +150,7 @@ def _torture_mutated(name: str, seed: int) -> dict[str, Any]:
     return torture(duration, seed, stop_event(), name)
 
 
-def failures(result: dict[str, Any]) -> list[str]:
+def find_failures(result: dict[str, Any]) -> list[str]:
     """Return the names of the figures that are above their limits."""
     return [name for name, limit in LIMITS.items() if (result[name] or 0) > limit]
 

@@ -408,7 +408,7 @@ def _measure_rest(
         if not len(rows):
             continue
         cube = cube[inside]
-        factor = pipeline.unloaded_factor(cube, rows.temperature, offset[inside])
+        factor = pipeline.compute_unloaded_factor(cube, rows.temperature, offset[inside])
         frequency = rows.frequency / factor
         pads = np.arange(frequency.shape[1])
         is_faulty = rows.pad_fault[:, np.newaxis] >> pads & 1 > 0

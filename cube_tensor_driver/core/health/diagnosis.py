@@ -201,7 +201,7 @@ class PadDiagnosis:
         """
         self._rest = rest_frequency
         self.noise = noise
-        self.bound = _square_bound(noise)
+        self.bound = _compute_square_bound(noise)
 
     def examine(self, window: Window, state: StatusBits) -> StatusBits:
         """Find the conditions of a window that has ended.
@@ -239,7 +239,7 @@ class PadDiagnosis:
         # Vibration raises the noise of all pads of a cube. They must not be reported as noisy then,
         # so the median noise of the pads is the usual noise if it is above that of the calibration.
         usual = np.fmax(self.noise, _lower_median(window.noise))
-        self.bound = _square_bound(usual)
+        self.bound = _compute_square_bound(usual)
         was_noisy = state & NOISY > 0
         ratio = np.where(was_noisy, NOISY_LEAVE, NOISY_ENTER)
         limit = ratio * usual
@@ -340,7 +340,7 @@ def has_high_residual(
     return np.where(rows > 0, is_high, was_high)
 
 
-def _square_bound(noise: Array) -> Array:
+def _compute_square_bound(noise: Array) -> Array:
     """Return the limit, in Hz², to which squared second differences of the frequency are cut.
 
     Without the cut, one jump of the frequency would count as high noise.

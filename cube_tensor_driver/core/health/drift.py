@@ -61,7 +61,8 @@ class DriftTracker:
 
         f0 += (mean(f) / unloaded_factor - f0) * WINDOW_S / time_constant
 
-    `Pipeline.unloaded_factor` corrects for temperature and for the effects that are compensated.
+    The factor (`Pipeline.compute_unloaded_factor`) corrects for temperature and for the effects
+    that are compensated.
 
     A cube is unloaded when all of its usable pads have been still and within `CONTACT_THRESHOLD`
     of their rest frequency for `RELEASE_S`. A load that stays below the threshold cannot be
@@ -103,7 +104,7 @@ class DriftTracker:
         window = self._health.history[-1]
         has_rows = window.rows > 0
         cubes = np.arange(len(has_rows))
-        factor = self._pipeline.unloaded_factor(cubes, self._health.temperature)
+        factor = self._pipeline.compute_unloaded_factor(cubes, self._health.temperature)
         measured = window.mean / factor
         # The rest frequency of a pad that a cube does not have is NaN, so this pad is never usable.
         is_left_out = self._health.state & LEFT_OUT > 0

@@ -124,7 +124,7 @@ def measure_rest(
 
     with np.errstate(invalid="ignore"):  # NaN where a cube has no such pad
         means = _average(windows)
-        factor = pipeline.unloaded_factor(chosen, health.temperature[chosen])
+        factor = pipeline.compute_unloaded_factor(chosen, health.temperature[chosen])
         rest = means.frequency / factor
         _check_pads(
             health,
