@@ -108,12 +108,17 @@ class SimulatedLink:
         """Let the hub state what the present faults make it state."""
         kinds = {record.fault.kind for record in self.faults}
         hub = self.hub
-        hub.false_uid = hub.uid ^ _FALSE_UID_BITS if "uid" in kinds else None
+        hub.false_uid = None
+        if "uid" in kinds:
+            hub.false_uid = hub.uid ^ _FALSE_UID_BITS
         hub.extra_pads = int("pads" in kinds)
         hub.version = VERSION + ("version" in kinds)
-        hub.pad_fault = np.zeros(len(hub.cube_uids), "<u4")
+        reported = np.zeros(len(hub.cube_uids), "<u4")
         for record in self.find_faults("report"):
-            hub.pad_fault[record.fault.cube] |= np.uint32(1 << record.fault.pad)
+            fault = record.fault
+            pad_bit = np.uint32(1 << fault.pad)
+            reported[fault.cube] |= pad_bit
+        hub.pad_fault = reported
 
 
 class Injector:
@@ -162,7 +167,9 @@ class Injector:
         sizes = {name: link.size for name, link in self._links.items()}
         # A fault without a link becomes one fault per link.
         for name in check_target(fault, sizes):
-            self._push(at_us, True, partial(self._begin, replace(fault, link=name)))
+            on_link = replace(fault, link=name)
+            begin = partial(self._begin, on_link)
+            self._push(at_us, True, begin)
 
     def _push(
         self,
@@ -170,7 +177,9 @@ class Injector:
         begins: bool,
         act: Callable[[int], None],
     ) -> None:
-        heapq.heappush(self._schedule, (at_us, begins, next(self._numbers), act))
+        number = next(self._numbers)
+        entry = (at_us, begins, number, act)
+        heapq.heappush(self._schedule, entry)
 
     def due_us(self) -> int | None:
         """Return the simulated time in µs at which the next fault begins or ends.
@@ -203,18 +212,28 @@ class Injector:
         # The newest change of the temperature replaces the earlier ones.
         for record in link.find_faults("temperature")[-1:]:
             # The temperature rises linearly during the fault and then stays constant.
+            fault = record.fault
             elapsed_s = 1e-6 * (now_us - record.start_us)
-            share = min(1.0, elapsed_s / max(record.fault.seconds, 1e-6))
-            rise = share * record.fault.value
+            duration_s = max(fault.seconds, 1e-6)
+            share = min(1.0, elapsed_s / duration_s)
+            rise = share * fault.value
             # A rise of 0 ends the fault. The hub then reports no temperature, as before it.
-            link.hub.celsius = round(100 * (ROOM_CELSIUS + rise)) if rise else TEMPERATURE_UNKNOWN
+            link.hub.celsius = TEMPERATURE_UNKNOWN
+            if rise:
+                link.hub.celsius = round(100 * (ROOM_CELSIUS + rise))
             warmed = frequency * (1 + RELATIVE_CHANGE_PER_CELSIUS * rise)
             frequency = np.rint(warmed).astype("<u4")
         for record in link.find_faults(*PAD_FAULTS):
             fault = record.fault
-            sound = int(frequency[fault.cube, fault.pad])
+            pad = fault.cube, fault.pad
+            sound = int(frequency[pad])
             first = link.first_readings.setdefault(record, sound)
-            frequency[fault.cube, fault.pad] = compute_broken_reading(fault, sound, first, now_us)
+            frequency[pad] = compute_broken_reading(
+                fault,
+                sound,
+                first,
+                now_us,
+            )
         no_cubes, pads_behind = (0, 0), (0, link.hub.extra_pads)
         return np.pad(frequency, (no_cubes, pads_behind))
 
@@ -273,8 +292,10 @@ class Injector:
             now_us: Simulated time in µs.
         """
         link = self._links[fault.link]
+        end_us = now_us
         is_momentary = fault.kind in MOMENTARY_FAULTS
-        end_us = now_us if is_momentary else now_us + round(1e6 * fault.seconds)
+        if not is_momentary:
+            end_us += round(1e6 * fault.seconds)
         record = FaultRecord(now_us, end_us, fault)
         self.records.append(record)
         match fault.kind:
@@ -302,7 +323,8 @@ class Injector:
             link.update_hub()
             # A changed temperature stays until the next fault of this kind.
             if fault.kind != "temperature":
-                self._push(end_us, False, partial(self._end, record))
+                end = partial(self._end, record)
+                self._push(end_us, False, end)
 
     def _end(self, record: FaultRecord, now_us: int) -> None:
         """End a fault on its link at simulated time `now_us`."""

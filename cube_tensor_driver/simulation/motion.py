@@ -85,7 +85,13 @@ class MovingFrame:
         times = seconds - STEP_S, seconds, seconds + STEP_S
         (_, before), (_, now), (_, after) = map(self._compute_pose, times)
         turning = now.T @ (after - before) / (2 * STEP_S)
-        return np.array([turning[2, 1], turning[0, 2], turning[1, 0]])
+        return np.array(
+            [
+                turning[2, 1],
+                turning[0, 2],
+                turning[1, 0],
+            ]
+        )
 
     def specific_force(
         self,
@@ -108,7 +114,9 @@ class MovingFrame:
         turned = after - 2 * now + before
         in_world = (moved + points @ turned.T) / STEP_S**2
         in_world[:, 2] += STANDARD_GRAVITY
-        return np.asarray(np.einsum("nji,nj->ni", now @ axes, in_world))
+        to_world = now @ axes
+        force = np.einsum("nji,nj->ni", to_world, in_world)
+        return np.asarray(force)
 
 
 class HeavyPads:
@@ -137,4 +145,5 @@ class HeavyPads:
 
     def stress(self, seconds: float) -> Array:
         """Return the stress of the pads by weight and inertia (cubes, P), in Pa."""
-        return np.asarray(self.specific_force(seconds) @ self._response.T)
+        force = self.specific_force(seconds)
+        return np.asarray(force @ self._response.T)

@@ -53,13 +53,16 @@ class CubicSpline:
         # Row i + 1 of `extend` takes the control point c[i] from those of the knots.
         rows_added = ((1, 1 + closed), (0, 0))
         identity = np.eye(n)
-        extend = (
-            np.pad(identity, rows_added, "wrap")
-            if closed
-            else np.pad(identity, rows_added, "reflect")
-        )
-        passed = (extend[:n] + 4 * extend[1 : n + 1] + extend[2 : n + 2]) / 6
-        self._control = extend @ np.linalg.solve(passed, knots)
+        if closed:
+            extend = np.pad(identity, rows_added, "wrap")
+        else:
+            extend = np.pad(identity, rows_added, "reflect")
+        before = extend[:n]
+        here = extend[1 : n + 1]
+        after = extend[2 : n + 2]
+        passed = (before + 4 * here + after) / 6
+        control = np.linalg.solve(passed, knots)
+        self._control = extend @ control
 
     def at(self, time: float) -> tuple[Array, Array]:
         """Return the position (D,) at a time from 0 to 1, and its derivative (D,) by the time."""
@@ -68,4 +71,5 @@ class CubicSpline:
         elapsed = time * intervals - i
         coefficients = _POWERS @ self._control[i : i + 4]
         position = np.asarray(polyval(elapsed, coefficients))
-        return position, intervals * polyval(elapsed, polyder(coefficients))
+        per_interval = polyval(elapsed, polyder(coefficients))
+        return position, intervals * per_interval

@@ -128,10 +128,12 @@ class WarmLayer:
         # with the ground, which is at half the distance.
         next_one = np.eye(CELLS, k=1)
         coupling = next_one + next_one.T
-        loss = np.tile(coupling.sum(axis=0), (len(height), 1))
+        exchanged = coupling.sum(axis=0)
+        loss = np.tile(exchanged, (len(height), 1))
         loss[:, 0] += 2
         loss[:, -1] += to_air
-        rate, self._vectors = np.linalg.eigh(coupling - loss[:, None] * np.eye(CELLS))
+        diagonal = loss[:, None] * np.eye(CELLS)
+        rate, self._vectors = np.linalg.eigh(coupling - diagonal)
         self._rate = -rate * DIFFUSIVITY / size**2
         # Amplitude of each eigenvector in the steady state, per °C of the ground and of the air.
         at_ground = self._vectors[:, 0]
