@@ -62,6 +62,13 @@ _LINK = mapping(
     },
 )
 """Schema of a link, the connection to one hub."""
+_CUBE_ADDRESS: JsonSchema = {
+    "oneOf": [{"required": ["uid"]}, {"required": ["index"]}],
+    "dependencies": {"index": ["link"]},
+    "description": "either a uid, or a link and an index",
+}
+"""Schema of the keys that state where a cube is: with a uid and an index, they might contradict
+each other when the cube is replaced. With a uid, the link may be left out."""
 _CUBE = mapping(
     ("name", "pose", "layout", "calibration"),
     {
@@ -73,8 +80,8 @@ _CUBE = mapping(
         "layout": TEXT,
         "calibration": TEXT,
     },
-)
-"""Schema of a cube, which the file identifies either by its link and index or by its uid."""
+) | {"allOf": [_CUBE_ADDRESS]}
+"""Schema of a cube."""
 _ELASTOMER = mapping(
     ("depth", "thickness"),
     {
@@ -254,10 +261,8 @@ def as_skin(skin: Skin | str | Path) -> Skin:
 def check_skin(path: Path) -> tuple[Skin | None, list[str]]:
     """Read a skin file and report all its mistakes.
 
-    An entry of the list of links or cubes is checked even if another entry is malformed.
-
     Returns:
-        The skin and an empty list, or None and the mistakes, one line each.
+        As `check_skin_data`.
 
     Raises:
         ConfigError: The file cannot be read or is not YAML.
@@ -276,52 +281,18 @@ def check_skin_data(
         folder: The folder in which the file is or will be. Calibrations are named relative to it.
 
     Returns:
-        The skin and an empty list, or None and all mistakes, one line each.
+        The skin and an empty list, or None and the mistakes, one line each: all that the schema
+        finds, or else all that concern several keys or files.
     """
-    schema_mistakes = _SCHEMA.mistakes(data)
-    mistakes = [line for _, line in schema_mistakes]
-    if not isinstance(data, dict):
+    mistakes = [line for _, line in _SCHEMA.mistakes(data)]
+    if mistakes or not isinstance(data, dict):
         return None, mistakes
-    # Further checks go through the entries of both lists, so both must be lists.
-    has_links = isinstance(data.get("links"), list)
-    has_cubes = isinstance(data.get("cubes"), list)
-    if not has_links or not has_cubes:
-        return None, mistakes
-    # The first two keys on the path to a mistake identify the entry of a link or a cube, as in
-    # ("cubes", 3, "pose").
-    malformed = {where[:2] for where, _ in schema_mistakes}
-
     links = tuple(
-        SkinLink(
-            item["name"],
-            item["port"],
-            item.get("baud", BAUD),
-            _parse_uid(item, "hub_uid"),
-        )
-        for number, item in enumerate(data["links"])
-        if ("links", number) not in malformed
+        SkinLink(item["name"], item["port"], item.get("baud", BAUD), _parse_uid(item, "hub_uid"))
+        for item in data["links"]
     )
-    mistakes += _find_link_mistakes(links)
-
-    # A cube may name a link whose entry is malformed and whose name is therefore unknown. So the
-    # links that cubes name are checked only if all links could be read.
-    link_names = [link.name for link in links]
-    all_links_known = len(set(link_names)) == len(data["links"])
-    # Malformed entries are skipped instead of ending the check, so that the user sees the mistakes
-    # of all entries at once.
-    items = {
-        number: item
-        for number, item in enumerate(data["cubes"])
-        if ("cubes", number) not in malformed
-    }
-    cubes, cube_mistakes = _read_cubes(items, folder, link_names if all_links_known else None)
-    mistakes += cube_mistakes
-    mistakes += _find_cube_mistakes(cubes)
-    mistakes += _find_pad_mistakes(links, cubes)
-
     elastomer = None
-    malformed_keys = {where[:1] for where, _ in schema_mistakes}
-    if "elastomer" in data and ("elastomer",) not in malformed_keys:
+    if "elastomer" in data:
         numbers = {key: float(value) for key, value in data["elastomer"].items()}
         numbers["thickness"] = numbers["thickness"] or np.inf
         elastomer = Elastomer(**numbers)
@@ -330,7 +301,13 @@ def check_skin_data(
                 f"elastomer.depth: {elastomer.depth} m; it must be below the thickness, "
                 f"{elastomer.thickness} m"
             )
-
+    cubes, cube_mistakes = _read_cubes(data["cubes"], folder, [link.name for link in links])
+    mistakes += [
+        *_find_link_mistakes(links),
+        *cube_mistakes,
+        *_find_cube_mistakes(cubes),
+        *_find_pad_mistakes(links, cubes),
+    ]
     if mistakes:
         return None, mistakes
     # YAML reads a rate without a decimal point as an integer.
@@ -347,17 +324,16 @@ def check_skin_data(
 
 
 def _read_cubes(
-    items: dict[int, dict[str, Any]],
+    items: list[dict[str, Any]],
     folder: Path,
-    links: list[str] | None,
+    links: list[str],
 ) -> tuple[tuple[SkinCube, ...], list[str]]:
     """Make cubes from their entries in a skin file, and read each calibration file only once.
 
     Args:
-        items: Index of a cube in the skin file -> its entry, the keys and values of the cube.
+        items: The entry of each cube in the skin file: its keys and values.
         folder: The folder of the skin file, in which calibration files are searched.
-        links: Names of all links of the file; None: the entry of a link is malformed, so names of
-            links cannot be checked.
+        links: Names of all links of the file.
 
     Returns:
         The cubes whose calibration could be read, and the mistakes, one line each.
@@ -366,7 +342,7 @@ def _read_cubes(
     mistakes: list[str] = []
     # A calibration that cannot be read is None. It is reported once, for its first cube.
     calibrations: dict[str, Calibration | None] = {}
-    for number, item in items.items():
+    for number, item in enumerate(items):
         name = item["calibration"]
         if name not in calibrations:
             calibrations[name] = None
@@ -388,39 +364,29 @@ def _read_cubes(
         )
         cubes.append(cube)
         for line in _find_contradictions(cube, item, links):
-            mistakes.append(f"cubes[{number}]{line}")
+            mistakes.append(f"cubes[{number}].{line}")
     return tuple(cubes), mistakes
 
 
 def _find_contradictions(
     cube: SkinCube,
     item: dict[str, object],
-    links: list[str] | None,
+    links: list[str],
 ) -> Iterator[str]:
-    """Yield a mistake for each key of a cube that contradicts another key or the calibration.
+    """Yield a mistake for each key of a cube that contradicts a link or the calibration.
 
     Args:
         cube: The cube.
         item: The entry of the cube in the skin file.
-        links: Names of all links of the file; None: they are not known.
+        links: Names of all links of the file.
     """
-    # An entry may leave out the link; then the cube is searched by its uid on all links.
-    if cube.link is not None and links is not None and cube.link not in links:
+    if cube.link is not None and cube.link not in links:
         allowed = ", ".join(sorted(links))
-        yield f".link: found {cube.link!r}, allowed: one of the links {allowed}"
-    if cube.uid is None and (cube.link is None or cube.index is None):
-        yield (
-            ": found neither uid nor both link and index, which say where the cube is; "
-            "add one of them"
-        )
-    # If the cube at this index is replaced by another one, the uid and the index in the file
-    # identify different cubes.
-    if cube.uid is not None and cube.index is not None:
-        yield ": found both uid and index; keep one, they might contradict each other"
+        yield f"link: found {cube.link!r}, allowed: one of the links {allowed}"
     calibration = cube.calibration
     if item["layout"] != calibration.layout.name:
         yield (
-            f".layout: found {item['layout']!r}, but the calibration {item['calibration']!r} "
+            f"layout: found {item['layout']!r}, but the calibration {item['calibration']!r} "
             f"is for the layout {calibration.layout.name!r}"
         )
     # A calibration with a uid was measured on that cube. A computed one has none and is valid
@@ -428,7 +394,7 @@ def _find_contradictions(
     if calibration.uid not in (None, cube.uid):
         found = "not given" if cube.uid is None else hex(cube.uid)
         yield (
-            f".calibration: {item['calibration']!r} was made for the cube with uid "
+            f"calibration: {item['calibration']!r} was made for the cube with uid "
             f"{calibration.uid:#x}, this cube's uid is {found}"
         )
 

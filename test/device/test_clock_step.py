@@ -115,6 +115,19 @@ def test_a_slow_hub_that_samples_early_has_not_set_its_clock(seed) -> None:
     assert not run.named.any() and run.in_doubt.sum() <= 8
 
 
+def test_a_hub_that_samples_early_during_a_pause_of_the_line_has_not_set_its_clock() -> None:
+    """The line holds samples for 0.1 s, which looks like a clock that was set back."""
+    true_s = np.arange(20_000) / 1000
+    true_s -= np.where(true_s >= AT_S, 0.005, 0)
+    late_s = np.where((true_s > AT_S - 0.01) & (true_s < AT_S + 0.1), 0.02, 0)
+
+    def delay(true_s, random):
+        return true_s + BASE_S + late_s + random.exponential(0.4e-3, len(true_s))
+
+    run = Run(delay, true_s, device_times(true_s), seed=1)
+    assert not run.named.any()
+
+
 def test_one_sample_that_is_late_is_not_two_steps() -> None:
     true_s = np.arange(2000) / 100
     true_s[1000] += 0.005
