@@ -11,7 +11,6 @@ device time (hub's clock) that fits its number and the clock line of its link (`
 from __future__ import annotations
 
 import ctypes
-import select
 import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -23,8 +22,8 @@ from ..wire.protocol import Frame
 from .link import Link
 
 ASK_PERIOD_S = 1e-3
-"""Time, in s, between two looks at the links for bytes on systems that cannot wait for serial ports
-(all but Linux). Bytes arrive up to this time late."""
+"""Time, in s, between two looks at the links for bytes without the module in C, or on systems that
+cannot wait for serial ports (all but Linux). Bytes arrive up to this time late."""
 
 
 class NativeSamples(NamedTuple):
@@ -109,10 +108,8 @@ class Intake:
             Whether bytes had been waiting before the call, so that this host is behind; the samples
             that were counted and stamped in C; and all other results of reading.
         """
-        if not Link.HAS_DESCRIPTORS:
+        if not Link.HAS_DESCRIPTORS or len(self._targets) < len(self._links):
             return self._ask_links(timeout_s)
-        if wire is None or len(self._targets) < len(self._links):
-            return self._read_in_python(timeout_s)
         is_late, links, raws, stamps_ns, reads = wire.read_links(
             self._targets,
             self._wake_fd,
@@ -135,42 +132,30 @@ class Intake:
             As `read`, with all frames among the other results: they are not decoded in C.
         """
         until = time.monotonic() + timeout_s
+        is_first = True
         while True:
-            is_open = [i for i, link in enumerate(self._links) if link.is_open]
-            reads = [read for read in self._read_ready(is_open) if read.result]
+            reads = [read for read in self._read_open() if read.result]
             if reads or time.monotonic() >= until:
-                return False, NO_SAMPLES, reads
+                return is_first and bool(reads), NO_SAMPLES, reads
+            is_first = False
             # There is no call on Windows that waits for serial ports and sockets together.
             time.sleep(ASK_PERIOD_S)
 
-    def _read_in_python(self, timeout_s: float) -> tuple[bool, NativeSamples, list[LinkRead]]:
-        """Wait, read and decode in Python; see `read`. It does not wait for the other links."""
-        poll = select.poll()
-        poll.register(self._wake_fd, select.POLLIN)
-        index_of = {}
+    def _read_open(self) -> list[LinkRead]:
+        """Read all open links once each, and decode their bytes in Python."""
+        results: list[tuple[int, bytes | LinkError]] = []
         for i, link in enumerate(self._links):
-            if link.is_open:
-                index_of[link.fileno()] = i
-                poll.register(link.fileno(), select.POLLIN)
-        ready = poll.poll(0)
-        is_late = bool(ready)
-        ready = ready or poll.poll(1000 * timeout_s)
-        indices = [index_of[fd] for fd, _ in ready if fd in index_of]
-        return is_late, NO_SAMPLES, self._read_ready(indices)
-
-    def _read_ready(self, ready: Sequence[int]) -> list[LinkRead]:
-        """Read the links with these indices once each, and decode their bytes in Python."""
-        results: list[bytes | LinkError] = []
-        for i in ready:
+            if not link.is_open:
+                continue
             try:
-                results.append(self._links[i].read())
+                results.append((i, link.read()))
             except LinkError as error:
-                results.append(error)
+                results.append((i, error))
         # The clock is read after the bytes, so that none of them arrived later, and before the
         # decoding, which takes time.
         arrival_ns = self._clock_ns()
         reads = []
-        for i, result in zip(ready, results, strict=True):
+        for i, result in results:
             if isinstance(result, LinkError):
                 reads.append(LinkRead(i, arrival_ns, result))
             else:
