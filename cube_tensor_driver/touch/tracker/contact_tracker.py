@@ -25,7 +25,7 @@ from ...core.arrays import Array, Index, Mask
 from ..inverse import FieldDeviation, SurfaceInverse, TractionField
 from ..surface import describe_contact
 from .contact_estimate import ContactEstimate
-from .fitted_field import add_fits, fit_variances
+from .fitted_field import add_fits
 from .hertz_fit import HertzFit, linearise
 from .local_values import CubeNoise, rotations_about_normal, unroll_points
 from .node_fit import NodeFit
@@ -204,9 +204,10 @@ class ContactTracker:
 
         It is computed when it is read, which takes several milliseconds for each contact.
         """
-        residual = self._scaled - self._response_to_fits()
-        residual_field = self._inverse.field_of_scaled(residual)
-        return add_fits(self._inverse, residual_field, self._fits)
+        residual = self._inverse.field_of_scaled(self._scaled - self._response_to_fits())
+        contacts, _ = add_fits(self._inverse, self._fits)
+        pairs = zip(residual, contacts, strict=True)
+        return TractionField(*(one + other for one, other in pairs))
 
     def deviation(self, values: Array) -> FieldDeviation:
         """Compute the standard deviations of `field`.
@@ -220,9 +221,9 @@ class ContactTracker:
         inverse = self._inverse
         residual = self._scaled - self._response_to_fits()
         deviation = inverse.residual_deviation(residual, inverse.scaled(values))
-        residual_variance = np.stack(deviation, axis=1) ** 2
-        variance = residual_variance + fit_variances(inverse, self._fits)
-        return FieldDeviation(*np.sqrt(variance).T)
+        _, contacts = add_fits(inverse, self._fits)
+        pairs = zip(deviation, contacts, strict=True)
+        return FieldDeviation(*(np.hypot(one, other) for one, other in pairs))
 
     def _response_to_fits(self) -> Array:
         """Return the response of all cubes to the traction of all fits.

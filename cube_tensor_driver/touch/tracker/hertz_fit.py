@@ -177,8 +177,9 @@ class HertzFit:
         # first scan of a fit there are none.
         self._previous: Discs | None = None
         n_contacts = len(starts.forces)
-        self._flatness = np.zeros(n_contacts)
-        self._moments = np.zeros(n_contacts)
+        # `_change` are the changes of the parameters by the last step. Flatness and moment are 0 at
+        # the contacts at which the response is linearised.
+        self._change = np.zeros((n_contacts, _N_PARAMETERS))
         flatness_deviation = 1.0
         moment_deviation = FORCE_DEVIATION * depth
         deviations = [
@@ -275,18 +276,8 @@ class HertzFit:
     def explained(self) -> Array:
         """Components (n, C), in Pa, that the contacts `found` cause in the n cubes around the
         region, by the linearised response `linear`."""
-        found = self.found
-        linear = self.linear
-        base = linear.contacts
-        change = np.empty((len(found.forces), _N_PARAMETERS))
-        change[:, :3] = found.forces - base.forces
-        change[:, 3:5] = found.centres - base.centres
-        change[:, 5] = found.log_sizes - base.log_sizes
-        change[:, 6] = self._flatness
-        change[:, 7] = self._moments
-        all_changes = np.append(change, self._elastomer_errors)
-        value_changes = linear.derivatives @ all_changes
-        return np.asarray(linear.values + value_changes)
+        changes = np.append(self._change, self._elastomer_errors)
+        return np.asarray(self.linear.values + self.linear.derivatives @ changes)
 
     def predict(self, extrapolates: bool) -> None:
         """Set the contacts at which the fit of a new scan (set of values of all cubes) begins.
@@ -357,8 +348,7 @@ class HertzFit:
 
         n_parameters = len(self._contact_precision)
         self._elastomer_errors = change[n_parameters:]
-        contact_change = change[:n_parameters]
-        self._move_contacts(contact_change.reshape(-1, _N_PARAMETERS))
+        self._move_contacts(change[:n_parameters].reshape(-1, _N_PARAMETERS))
 
     def _move_contacts(self, change: Array) -> None:
         """Change the contacts from those at which the response is linearised.
@@ -368,20 +358,14 @@ class HertzFit:
                 are limited to `_MAX_STEP`.
         """
         base = self.linear.contacts
-        limit = _MAX_STEP * self._depth
-        shift = change[:, 3:5].clip(-limit, limit)
-        growth = change[:, 5].clip(-_MAX_STEP, _MAX_STEP)
-        largest_shift = np.abs(shift).max() / self._depth
-        largest_growth = np.abs(growth).max()
-        self.last_step = float(max(largest_shift, largest_growth))
-        log_sizes = base.log_sizes + growth
-        self.found = Discs(
-            forces=base.forces + change[:, :3],
-            centres=base.centres + shift,
-            log_sizes=log_sizes.clip(*self._log_range),
-        )
-        self._flatness = change[:, 6]
-        self._moments = change[:, 7]
+        lengths = np.array([self._depth, self._depth, 1.0])
+        steps = (change[:, 3:6] / lengths).clip(-_MAX_STEP, _MAX_STEP)
+        self.last_step = float(np.abs(steps).max())
+        change[:, 3:6] = steps * lengths
+        log_sizes = (base.log_sizes + change[:, 5]).clip(*self._log_range)
+        change[:, 5] = log_sizes - base.log_sizes
+        self._change = change
+        self.found = Discs(base.forces + change[:, :3], base.centres + change[:, 3:5], log_sizes)
 
     def to_contacts(self, step: float) -> ContactSum:
         """Describe the contacts, with flatness, moment and covariance, as a sum of Hertz contacts.
@@ -394,78 +378,72 @@ class HertzFit:
             step: Shift in m. It is at least the spacing of the points at which the traction is
                 evaluated, because contacts shifted by less have the same traction there.
         """
-        count = len(self.found.forces)
         no_shift = np.zeros((2, 2))
-        shifts = np.concatenate([step * _STENCIL, no_shift])
-        places = self.found.centres[:, None] + shifts
-        log_growth = FLATNESS_STEP * np.array([0, 0, 0, 0, 0, 1, -1])
-        growth = np.exp(log_growth)
-        radii = np.exp(self.found.log_sizes)
-        sizes = radii[:, None] * growth
+        places = self.found.centres[:, None] + np.concatenate([step * _STENCIL, no_shift])
+        growth = np.exp(FLATNESS_STEP * np.array([0, 0, 0, 0, 0, 1, -1]))
+        sizes = np.exp(self.found.log_sizes)[:, None] * growth
 
-        # `slopes` are the derivatives (3 axes, J, 7, J, 8) of the forces of all Hertz contacts of
-        # the sum by the 8 parameters of each of the J fitted contacts.
-        slopes = np.zeros((3, count, 7, count, _N_PARAMETERS))
+        # `patterns` are shares of force of the seven contacts: the whole, its derivatives by x, y
+        # and the logarithm of the radius, and the difference that defines the flatness.
         wider_share = 1 / (1 + np.exp(2 * FLATNESS_STEP))
-        narrower_share = 1 - wider_share
-        # These are indices of the shifted and the resized ones of the seven Hertz contacts.
-        x_shifted = [1, 2]
-        y_shifted = [3, 4]
-        resized = [5, 6]
-        # Four forces of 1 / (4 step) at this arm have a moment of 1 N m.
-        unit_moment_force = np.array([1, -1]) / (4 * step)
-        all_forces = self.found.forces[:, :, None]
-        for j, force in enumerate(all_forces):
-            own = slopes[:, j, :, j]
-            difference = force * [1, -1]
-            by_shift = difference / (2 * step)
-            own[:, 0, :3] = np.eye(3)
-            own[:, x_shifted, 3] = by_shift
-            own[:, y_shifted, 4] = by_shift
-            own[:, resized, 5] = difference / (2 * FLATNESS_STEP)
-            own[:, 0, 6] = force[:, 0]
-            own[:, resized, 6] = force * [-wider_share, -narrower_share]
-            own[1, x_shifted, 7] = unit_moment_force
-            own[0, y_shifted, 7] = -unit_moment_force
-        by_flatness = slopes[..., 6]
-        by_moment = slopes[..., 7]
-        forces = np.einsum("ajkj,j->ajk", by_flatness, self._flatness)
-        forces += np.einsum("ajkj,j->ajk", by_moment, self._moments)
-        forces[:, :, 0] += self.found.forces.T
+        patterns = np.zeros((5, 7))
+        patterns[[0, 4], 0] = 1
+        patterns[1, 1:3] = np.array([1, -1]) / (2 * step)
+        patterns[2, 3:5] = np.array([1, -1]) / (2 * step)
+        patterns[3, 5:] = np.array([1, -1]) / (2 * FLATNESS_STEP)
+        patterns[4, 5:] = -wider_share, wider_share - 1
+        # `slopes` are the derivatives (J, 8, 3, 7) of the forces of the seven contacts by the eight
+        # parameters. Half the derivatives by x and y are shears with a moment of 1 N m.
+        slopes = np.zeros((len(places), _N_PARAMETERS, 3, 7))
+        slopes[:, :3] = np.eye(3)[:, :, None] * patterns[0]
+        slopes[:, 3:7] = patterns[1:, None] * self.found.forces[:, None, :, None]
+        slopes[:, 7, 1] = patterns[1] / 2
+        slopes[:, 7, 0] = -patterns[2] / 2
+        shape = self._change[:, 6:, None, None] * slopes[:, 6:]
+        forces = self.found.forces[:, :, None] * patterns[0] + shape.sum(axis=1)
 
-        n_parameters = _N_PARAMETERS * count
-        covariance = self.linear.covariance[:n_parameters, :n_parameters]
-        covariance = self.inflation * covariance
-        cholesky_factor = np.linalg.cholesky(covariance)
-        all_slopes = slopes.reshape(3, -1, n_parameters)
+        # Errors of different contacts of a region are treated as independent here.
+        roots = np.linalg.cholesky(self._covariances)
+        by_contact = np.einsum("jpak,jpm->jakm", slopes, roots)
+        root = np.zeros((3, len(places), 7, len(places), _N_PARAMETERS))
+        for j, own in enumerate(by_contact):
+            root[:, j, :, j] = own
         return ContactSum(
             places=places.reshape(-1, 2),
             sizes=sizes.ravel(),
-            forces=forces.reshape(3, -1),
-            root=all_slopes @ cholesky_factor,
+            forces=forces.swapaxes(0, 1).reshape(3, -1),
+            root=root.reshape(3, 7 * len(places), -1),
         )
+
+    @property
+    def _covariances(self) -> Array:
+        """Covariances (J, 8, 8) of the parameters of each contact."""
+        n_contacts = len(self.found.forces)
+        n_parameters = n_contacts * _N_PARAMETERS
+        covariance = self.inflation * self.linear.covariance[:n_parameters, :n_parameters]
+        blocks = covariance.reshape(n_contacts, _N_PARAMETERS, n_contacts, _N_PARAMETERS)
+        contact = np.arange(n_contacts)
+        return np.asarray(blocks[contact, :, contact])
 
     def estimate_contacts(self) -> list[ContactEstimate]:
         """Return force, position, moment and area of each contact."""
         estimates = []
-        for j, log_size in enumerate(self.found.log_sizes.tolist()):
-            first = _N_PARAMETERS * j
-            own = slice(first, first + _N_PARAMETERS)
-            covariance = self.inflation * self.linear.covariance[own, own]
+        for discs, change, covariance in zip(
+            zip(*self.found, strict=True), self._change, self._covariances, strict=True
+        ):
+            force, centre, log_size = discs
             variances = np.diag(covariance)
-            squared_radius = np.exp(2 * log_size)
-            area = float(np.pi * squared_radius)
-            # The area is proportional to exp(2 ln a), so its derivative by ln a is 2 area.
-            area_variance = (2 * area) ** 2 * variances[5]
+            area = float(np.pi * np.exp(2 * log_size))
             estimate = ContactEstimate(
-                force=self.found.forces[j],
+                force=force,
                 force_covariance=covariance[:3, :3],
-                place=self.found.centres[j],
+                place=centre,
                 place_variance=variances[3:5],
-                moment=float(self._moments[j]),
+                moment=float(change[7]),
                 moment_variance=float(variances[7]),
                 area=area,
-                area_variance=float(area_variance),
+                # The derivative of the area pi exp(2 ln a) by ln a is 2 area.
+                area_variance=float((2 * area) ** 2 * variances[5]),
                 aspect=1.0,
             )
             estimates.append(estimate)
