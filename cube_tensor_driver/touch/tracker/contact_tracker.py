@@ -31,7 +31,6 @@ from .local_values import CubeNoise, rotations_about_normal, unroll_points
 from .node_fit import NodeFit
 from .pressure_regions import PressureRegions
 from .tracked_region import (
-    WORK_MS,
     TrackedRegion,
     Work,
     update_responses,
@@ -45,11 +44,11 @@ when the regions beside it are fitted, too."""
 MAX_REGIONS = 32
 """Largest number of regions of contact on one skin; those with the largest pressure are kept."""
 
-MAX_WORK_PER_SCAN = 7.2
+MAX_WORK_PER_SCAN = 8.0
 """Computing work in one scan (set of values of all cubes), in ms (`WORK_MS`), up to which further
 steps of fits are made; the remaining steps are made in the next scans. One step is always made."""
 
-TRACKING_WORK_MS = 0.15
+TRACKING_WORK_MS = 0.25
 """CPU time in ms that it takes to compute a fit for the values of the next scan."""
 
 MATCH_PITCHES = 1.0
@@ -236,6 +235,7 @@ class ContactTracker:
         update_responses(self._inverse, fitted, all_cubes)
         total = 0 * self._scaled
         for region in fitted:
+            region.store_response()
             total = total + region.response
         return np.asarray(total)
 
@@ -314,12 +314,10 @@ class ContactTracker:
             fit = region.fit
             if fit is not None:
                 region.subtract_others(fit.values, total, deviation)
+                cubes = fit.values.cubes
+                before = region.response[cubes]
                 region.step()
-                if region.near:
-                    cubes = fit.values.cubes
-                    explained = fit.explained
-                    total[cubes] += explained - region.response[cubes]
-                    region.response[cubes] = explained
+                total[cubes] += region.response[cubes] - before
 
     def _sum_responses(self) -> tuple[Array, Array]:
         """Return the stored response (cubes, C), in Pa, of all cubes to all regions, and its
@@ -356,10 +354,12 @@ class ContactTracker:
             number = min(range(len(order)), key=order.__getitem__)
             region = self._regions[number]
             work, _ = order[number]
-            if work == Work.NONE or (left < WORK_MS[work] and not is_first):
+            if work == Work.NONE:
+                break
+            left -= region.estimate_ms(work)
+            if left < 0 and not is_first:
                 break
             region.improve(work)
-            left -= WORK_MS[work]
             is_first = False
             order[number] = region.next_work, -region.waited
 

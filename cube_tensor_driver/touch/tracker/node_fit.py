@@ -150,8 +150,9 @@ class NodePosterior(NamedTuple):
 class NodeFit:
     """Traction in one region on a grid of nodes (small Hertz contacts).
 
-    `solve` and `sharpen` compute the posterior of the forces of the nodes, which takes
-    milliseconds. `step` only multiplies the values of later scans by matrices of this posterior.
+    `solve`, `settle` and `sharpen` compute the posterior of the forces of the nodes, which takes
+    milliseconds each. `step` only multiplies the values of later scans by matrices of this
+    posterior.
 
     Attributes:
         places: Positions (q, 2) of the nodes in m, on the skin laid flat.
@@ -163,6 +164,8 @@ class NodeFit:
         misfit: Chi-squared divided by the number of known values; at least 1. It multiplies the
             covariance of the forces.
         score: -2 ln of the evidence, up to a constant.
+        is_solved: Whether `solve` was called.
+        is_settled: Whether `settle` was called after the last `solve` or `sharpen`.
         is_sharp: Whether `sharpen` has found that a narrower prior has no greater evidence.
     """
 
@@ -203,7 +206,9 @@ class NodeFit:
         self._covariance = self.spacing**4 * pressure_covariance
 
         # The response (n, C, 3 q) in Pa/N has the forces in the order of `to_forces`.
-        self._response = values.respond(self.places, self.size)
+        self._response = values.respond(self.places, self.size).astype(np.float32)
+        self.is_solved = False
+        self.is_settled = False
         self.is_sharp = False
 
     def solve(self, white: Array) -> None:
@@ -220,9 +225,21 @@ class NodeFit:
         equal_envelope = np.ones(len(self.places))
         self._decomposition = self._decompose(equal_envelope)
         self._condition(white)
-        self._include_elastomer(white)
+        self.is_solved = True
+        self.is_settled = False
         self.is_sharp = False
+
+    def settle(self, white: Array) -> None:
+        """Include errors of the elastomer, and find the contacts.
+
+        Args:
+            white: Whitened values (n C,), as for `solve`.
+        """
+        sensitivity = self.values.sensitivity(self.places, self.size, self.forces)
+        self._set_sensitivity(sensitivity)
+        self._condition(white)
         self._separate_contacts()
+        self.is_settled = True
 
     def sharpen(self, white: Array) -> None:
         """Fit again with a prior that allows less force where the present fit finds little force.
@@ -233,22 +250,16 @@ class NodeFit:
         Args:
             white: Whitened values (n C,), as for `solve`.
         """
-        self._include_elastomer(white)
+        self._condition(white)
         present = self.posterior, self._decomposition
         score = self.score
         self._decomposition = self._decompose(self._envelope)
         self._condition(white)
-        if self.score > score - MIN_SCORE_GAIN:
+        self.is_sharp = self.score > score - MIN_SCORE_GAIN
+        self.is_settled = self.is_sharp
+        if self.is_sharp:
             self.posterior, self._decomposition = present
             self.step(white)
-            self.is_sharp = True
-        self._separate_contacts()
-
-    def _include_elastomer(self, white: Array) -> None:
-        """Compute the posterior again, with errors of the elastomer under the present forces."""
-        sensitivity = self.values.sensitivity(self.places, self.size, self.forces)
-        self._set_sensitivity(sensitivity)
-        self._condition(white)
 
     def step(self, white: Array) -> None:
         """Compute forces and misfit for new values of the same cubes.
@@ -275,7 +286,8 @@ class NodeFit:
     def explained(self) -> Array:
         """Components (n, C), in Pa, that the forces cause in the cubes around the region."""
         by_errors = self._sensitivity[:, :, 1:] @ self._errors
-        return np.asarray(self._response @ self.forces.ravel() + by_errors)
+        forces = self.forces.ravel().astype(np.float32)
+        return np.asarray(self._response @ forces + by_errors)
 
     @property
     def discs(self) -> Discs:

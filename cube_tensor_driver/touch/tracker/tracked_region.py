@@ -10,6 +10,7 @@ the one with the greater evidence (probability of the values) is kept.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from enum import IntEnum
 
 import numpy as np
@@ -19,7 +20,7 @@ from ..inverse import SurfaceInverse
 from .contact_estimate import ContactEstimate, Discs, discs_of
 from .hertz_fit import HertzFit, linearise
 from .local_values import MIN_FACING, CubeNoise, LocalValues
-from .node_fit import NodeFit
+from .node_fit import MAX_NODES, NODE_STEP, NodeFit
 
 MAX_CUBES = 48
 """Largest number of cubes from whose values the traction in one region of contact is fitted. A
@@ -120,6 +121,10 @@ forces of fourteen contacts were off by 2.2 stated deviations."""
 MAX_STEPS = 10
 """Largest number of Gauss-Newton steps in the first fit of a Hertz contact."""
 
+HOPELESS = 4.0
+"""Misfit after half of the steps, divided by the largest misfit with which a fit of a Hertz contact
+is kept, above which the other half is not made."""
+
 Respond = Callable[[Index], tuple[Array, Array]]
 """Function that takes the indices of n cubes and returns the response of all cubes of the skin to
 all regions of contact, up to date for these n: changes (cubes, C), in Pa, of their C measured
@@ -130,30 +135,35 @@ class Work(IntEnum):
     """Next step of the fit of a region of contact. Steps with the smallest number are made first.
 
     MOVE makes a Gauss-Newton step of Hertz contacts. BEGIN makes the first fit of a Hertz contact.
-    SOLVE makes the fit on nodes (small contacts on a grid) that PREPARE has placed. CHOOSE tries
-    Hertz contacts in its place. SHARPEN repeats the fit on nodes with a narrower prior. NONE stands
-    for a fit that needs no step.
+    PREPARE places nodes (small contacts on a grid); SOLVE and SETTLE fit the traction on them.
+    CHOOSE tries Hertz contacts in its place. RENEW solves again for the same nodes. SHARPEN repeats
+    the fit with a narrower prior. NONE stands for a fit that needs no step.
     """
 
     MOVE = 0
     BEGIN = 1
-    SOLVE = 2
-    CHOOSE = 3
-    PREPARE = 4
-    SHARPEN = 5
-    NONE = 6
+    SETTLE = 2
+    SOLVE = 3
+    CHOOSE = 4
+    PREPARE = 5
+    RENEW = 6
+    SHARPEN = 7
+    NONE = 8
 
 
 WORK_MS = {
     Work.MOVE: 0.5,
-    Work.BEGIN: 2.0,
-    Work.SOLVE: 4.0,
+    Work.BEGIN: 3.5,
+    Work.SETTLE: 3.0,
+    Work.SOLVE: 4.5,
     Work.CHOOSE: 2.5,
-    Work.PREPARE: 3.0,
+    Work.PREPARE: 3.5,
+    Work.RENEW: 4.5,
     Work.SHARPEN: 4.0,
 }
-"""CPU time in ms that the steps of a large region were measured to take. The work in a scan is
-counted with these numbers, not with a clock, so that a recording gives the same contacts again."""
+"""CPU time in ms that the steps of a region with `MAX_NODES` nodes were measured to take. The work
+in a scan is counted with these numbers, not with a clock, so that a recording gives the same
+contacts again."""
 
 
 class TrackedRegion:
@@ -305,13 +315,12 @@ class TrackedRegion:
         facing = cubes[cosines > MIN_FACING]
         return LocalValues(self._inverse, self._noise, home, facing)
 
-    def _collect_newest(self, home: int, cubes: Index) -> LocalValues:
-        """Return what `_collect` returns for the newest values, and set `others` for it."""
-        self._noise.update(self._noise.scaled, cubes)
-        values = self._collect(home, cubes)
-        self.subtract_others(values, *self._respond(cubes))
+    def _whiten_newest(self, values: LocalValues) -> Array:
+        """Return `_whiten` with the newest noise of the cubes and response to other regions."""
+        self._noise.update(self._noise.scaled, values.cubes)
+        self.subtract_others(values, *self._respond(values.cubes))
         values.refresh()
-        return values
+        return self._whiten(values)
 
     @property
     def has_fitted_neighbours(self) -> bool:
@@ -348,25 +357,27 @@ class TrackedRegion:
 
         If the contacts of the region have changed by more than `MAX_STALE_CHANGE` since responses
         were computed, these are all of the cubes. If not, they are the cubes whose response has not
-        been computed for these contacts.
+        been computed for these contacts. The cubes of the fit are never among them, because the
+        fit itself predicts their response.
 
         Args:
             cubes: Indices (n,) of the cubes.
         """
         home, discs = self.discs
         old_home, old = self._responded
-        if home == old_home and len(old.forces) == len(discs.forces):
-            shift = np.abs(discs.centres - old.centres)
-            relative_shift = shift.max() / self.gap
-            force_change = np.abs(discs.forces - old.forces)
-            largest_force = np.abs(discs.forces).max()
-            relative_change = force_change.max() / largest_force
+        is_changed = home != old_home or len(old.forces) != len(discs.forces)
+        if not is_changed:
+            relative_shift = np.abs(discs.centres - old.centres).max() / self.gap
+            force_change = np.abs(discs.forces - old.forces).max()
+            relative_change = force_change / np.abs(discs.forces).max()
             limit = MAX_STALE_CHANGE * self.relative_error
-            if max(relative_shift, relative_change) < limit:
-                return cubes[~self._responding[cubes]]
-        self._responding[:] = False
-        self._responded = home, discs
-        return cubes
+            is_changed = max(relative_shift, relative_change) >= limit
+        if is_changed:
+            self._responding[:] = False
+            self._responded = home, discs
+        if self.fit is not None:
+            self._responding[self.fit.values.cubes] = True
+        return cubes[~self._responding[cubes]]
 
     def take_response(self, cubes: Index, response: Array) -> None:
         """Store the newest response of some cubes to this region.
@@ -395,7 +406,7 @@ class TrackedRegion:
         if fit is None and self._is_hertz_due:
             return Work.BEGIN
         if self._prepared is not None:
-            return Work.SOLVE
+            return Work.SETTLE if self._prepared.is_solved else Work.SOLVE
         is_worse = self._is_misfit_larger
         may_prepare = not self._is_tried
         if isinstance(fit, HertzFit):
@@ -405,16 +416,26 @@ class TrackedRegion:
             is_lastingly_worse = is_worse and self._bad_scans >= MAX_BAD_SCANS
             may_prepare &= is_lastingly_worse and self.has_fitted_neighbours
         elif fit is not None:
+            if not fit.is_settled:
+                return Work.SETTLE
             if self._is_hertz_due:
                 return Work.CHOOSE
             if may_prepare and self._moved_share <= MAX_CHANGE:
                 peak_change = abs(self.peak / self._fitted_peak - 1)
                 if peak_change > MAX_CHANGE or is_worse or self._have_others_changed(fit):
-                    return Work.SOLVE
+                    return Work.RENEW
                 may_prepare = False
             if not may_prepare:
                 return Work.NONE if fit.is_sharp else Work.SHARPEN
         return Work.PREPARE if may_prepare else Work.NONE
+
+    def estimate_ms(self, work: Work) -> float:
+        """Return the computing time in ms that a step of this region takes."""
+        if work in (Work.MOVE, Work.BEGIN, Work.CHOOSE):
+            return WORK_MS[work]
+        area = len(self.points) * self._inverse.area
+        n_nodes = area / (NODE_STEP * self._inverse.depth) ** 2
+        return WORK_MS[work] * min(n_nodes / MAX_NODES, 1.0)
 
     def improve(self, work: Work) -> None:
         """Make the next step of the fit, for the newest values.
@@ -428,8 +449,10 @@ class TrackedRegion:
             self._begin_hertz()
         elif work == Work.PREPARE:
             self._prepare_nodes()
-        elif work == Work.SOLVE:
+        elif work in (Work.SOLVE, Work.RENEW):
             self._solve_nodes()
+        elif work == Work.SETTLE:
+            self._settle_nodes()
         elif isinstance(fit, HertzFit):
             self._steps += 1
             self._iterate(fit, 1)
@@ -445,6 +468,13 @@ class TrackedRegion:
         step."""
         if self.fit is not None:
             self.fit.step(self._whiten(self.fit.values))
+            if np.isfinite(self.gap):
+                self.store_response()
+
+    def store_response(self) -> None:
+        """Store the response of the cubes of the fit, which the fit predicts."""
+        if self.fit is not None:
+            self.response[self.fit.values.cubes] = self.fit.explained
 
     def _whiten(self, values: LocalValues) -> Array:
         """Return the newest values of cubes minus the response to other regions, whitened."""
@@ -468,10 +498,13 @@ class TrackedRegion:
         converged.
         """
         self._is_hertz_due = False
-        values = self._collect_newest(self.home, self._inverse.near[self.home])
+        values = self._collect(self.home, self._inverse.near[self.home])
+        self._whiten_newest(values)
         fit = HertzFit(self._inverse, values, self._start)
-        self._iterate(fit, MAX_STEPS)
         limit = MAX_NEAR_MISFIT if self.near else MAX_HERTZ_MISFIT
+        self._iterate(fit, MAX_STEPS // 2)
+        if fit.needs_linearisation and fit.shape_misfit < HOPELESS * limit:
+            self._iterate(fit, MAX_STEPS // 2)
         is_settled = not fit.is_unsettled or self.near
         if values.count and is_settled and fit.shape_misfit < limit:
             self._accept(fit)
@@ -508,26 +541,32 @@ class TrackedRegion:
         for count in NEAREST_CUBES:
             cubes = np.unique(inverse.near[self.cubes, :count])
             if len(cubes) <= MAX_CUBES:
-                values = self._collect_newest(self.home, cubes)
+                self._noise.update(self._noise.scaled, cubes)
+                values = self._collect(self.home, cubes)
                 if values.count:
                     self._prepared = NodeFit(inverse, self.points, values)
                 return
 
     def _solve_nodes(self) -> None:
-        """Fit the traction on the nodes that have been prepared, or again on those of the present
-        fit."""
+        """Fit the traction on nodes that are prepared, or again on those of the present fit."""
         self._is_tried = True
+        fit = self._prepared or copy(self.fit)
+        self._prepared = None
+        if isinstance(fit, NodeFit) and fit.values.has_same_values:
+            fit.values = copy(fit.values)
+            fit.solve(self._whiten_newest(fit.values))
+            self._prepared = fit
+
+    def _settle_nodes(self) -> None:
+        """Finish the fit that has been solved or sharpened, and keep it."""
         fit = self._prepared or self.fit
         self._prepared = None
-        if not isinstance(fit, NodeFit) or not fit.values.has_same_values:
-            return
-        values = fit.values
-        self._noise.update(self._noise.scaled, values.cubes)
-        self.subtract_others(values, *self._respond(values.cubes))
-        values.refresh()
-        fit.solve(self._whiten(values))
-        self._is_hertz_due = not self._is_direct
-        self._accept(fit)
+        if isinstance(fit, NodeFit) and fit.values.has_same_values:
+            self.subtract_others(fit.values, *self._respond(fit.values.cubes))
+            fit.settle(self._whiten(fit.values))
+            if fit is not self.fit:
+                self._is_hertz_due = not self._is_direct
+                self._accept(fit)
 
     def _replace_by_hertz(self, nodes: NodeFit) -> None:
         """Replace the fit on nodes by one Hertz contact for each of its contacts, if that increases
@@ -556,6 +595,8 @@ class TrackedRegion:
         regions and the misfit. If later scans differ from it too much, the region is fitted again.
         """
         self.fit = fit
+        self._responded = -1, fit.discs
+        self.store_response()
         self._fitted_points = self.points
         self._fitted_peak = self.peak
         self._fitted_others = self.others
@@ -572,7 +613,7 @@ def update_responses(
 
     The response is only computed again for regions whose contacts have changed. It is computed for
     round Hertz contacts, because the stress in distant cubes hardly depends on the shape of a
-    contact. For the cubes of a region's own fit, it is the response that this fit predicts.
+    contact.
 
     Args:
         inverse: Poses and responses of the skin.
@@ -583,10 +624,6 @@ def update_responses(
     stale = [(region, own) for region, own in stale if len(own)]
     if stale:
         _update_stale_responses(inverse, stale)
-    for region in regions:
-        fit = region.fit
-        if fit is not None:
-            region.response[fit.values.cubes] = fit.explained
 
 
 def _update_stale_responses(
