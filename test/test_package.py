@@ -32,7 +32,8 @@ FLOORS = [
     ["messages"],
     ["touch"],
     ["device", "mechanics"],
-    ["config", "processes"],
+    ["processes"],
+    ["config"],
     ["core"],
 ]
 """Folders of the driver. One may import those below it in this list, none above or beside it."""
