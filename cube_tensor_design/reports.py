@@ -131,7 +131,8 @@ def _show_convergence(result: Response) -> None:
             step = f"{100 * abs(values[-1] / values[-2] - 1):.2g} %"
         rows.append([name, *(f"{value:.5f}" for value in values), step])
     # The last mesh has no next one.
-    changes = [f"{100 * mesh['change']:.2g} %" for mesh in meshes[:-1]]
+    steps = [mesh["change"] for mesh in meshes]
+    changes = [f"{100 * step:.2g} %" for step in steps if step is not None]
     seconds = [f"{mesh['seconds']:.1f}" for mesh in meshes]
     footer = [["change to the next", *changes], ["seconds", *seconds]]
     unknowns = [str(mesh["unknowns"]) for mesh in meshes]

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from cube_tensor_driver.device.wire.protocol import Hello
 
@@ -40,7 +39,7 @@ class Checked:
             number for number, result in self.results.items() if result.outcome is Outcome.FAILED
         ]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the results as plain values, for the JSON file of `./cube check --json`."""
         hello = self.hello
         return {

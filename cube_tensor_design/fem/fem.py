@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypedDict
 
 import numpy as np
 import skfem
@@ -61,6 +61,17 @@ ground. Without ground a rigid cube is held at rest, but on ground it moves rela
 ground."""
 
 
+class Convergence(TypedDict):
+    """Result on one mesh: number of unknowns, seconds, coefficients by name, and the largest change
+    of an entry of the response to the next finer mesh over the largest entry (None for the
+    last)."""
+
+    unknowns: int
+    seconds: float
+    coefficients: dict[str, float]
+    change: float | None
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Response:
     """A computed response matrix: stress of each pad under each mode (linear stress field).
@@ -77,8 +88,7 @@ class Response:
         mode_residual: The same ratio for the column of each mode.
         rank: Number of independent states that the pads observe.
         unobservable: Names of the modes that the pads cannot tell from others.
-        convergence: One row per mesh: unknowns, seconds, coefficients, and `change`, the largest
-            change of an entry to the next finer mesh over the largest entry (None for the last).
+        convergence: One row per mesh.
         seconds: Time of the computation, in s.
     """
 
@@ -92,10 +102,10 @@ class Response:
     mode_residual: dict[str, float]
     rank: int
     unobservable: tuple[str, ...]
-    convergence: tuple[dict[str, Any], ...]
+    convergence: tuple[Convergence, ...]
     seconds: float
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the content of the file of --json."""
         return {
             **vars(self),
@@ -130,12 +140,12 @@ def compute_response(
     changes = [result.change for result in results[1:]]
     rows = []
     for result, change in zip(results, [*changes, None], strict=True):
-        row = {
-            "unknowns": result.unknowns,
-            "seconds": result.seconds,
-            "coefficients": project(structure, result.pads)[0],
-            "change": change,
-        }
+        row = Convergence(
+            unknowns=result.unknowns,
+            seconds=result.seconds,
+            coefficients=project(structure, result.pads)[0],
+            change=change,
+        )
         rows.append(row)
 
     matrix = results[-1].pads
@@ -351,7 +361,7 @@ def pad_stresses(
         load: The loads.
         report: Called as report(what) before every solve.
     """
-    stresses: Any = 0.0
+    parts = []
     for parity in iterate_parities(solid, report):
         in_body, *in_cube = load(parity)
         forces = sum(in_cube, in_body)
@@ -366,8 +376,8 @@ def pad_stresses(
             displacement = solid.solve(parity, forces[:, used])
             reactions = solid.body @ displacement - in_body[:, used]
             part[:, used] = weights @ reactions
-        stresses = stresses + part
-    return stresses
+        parts.append(part)
+    return np.sum(parts, axis=0)
 
 
 def iterate_parities(

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -74,7 +74,7 @@ def stiffness(scalar: skfem.Basis, moduli: tuple[float, float]) -> sp.csr_matrix
     """
     lam, mu = moduli
     dim = scalar.mesh.dim()
-    total: Any = 0
+    blocks: list[sp.spmatrix] = []
     for a, b in itertools.product(range(dim), repeat=2):
         form = skfem.BilinearForm(lambda u, w, _, a=a, b=b: w.grad[a] * u.grad[b])
         slopes = form.assemble(scalar)
@@ -82,11 +82,11 @@ def stiffness(scalar: skfem.Basis, moduli: tuple[float, float]) -> sp.csr_matrix
         place = np.zeros((dim, dim))
         place[a, b] = 1.0
         coupling = lam * slopes + mu * slopes.T
-        total = total + sp.kron(coupling, place)
+        blocks.append(sp.kron(coupling, place))
         if a == b:
             # The part of mu grad u : grad w couples equal components only.
-            total = total + sp.kron(mu * slopes, np.eye(dim))
-    return total.tocsr()
+            blocks.append(sp.kron(mu * slopes, np.eye(dim)))
+    return sum(blocks).tocsr()
 
 
 def sample_matrix(basis: skfem.Basis, values: Array) -> sp.csr_matrix:
@@ -197,7 +197,7 @@ class Solid:
         edges = mesh.boundary_facets()
         corners = mesh.p[:, mesh.facets[:, edges]]
         centres = corners.mean(axis=1)
-        total: Any = 0.0
+        total: Array | float = 0.0
         for axis, sign in itertools.product(range(self.dim), (1, -1)):
             end = (sign * mesh.p[axis]).max()
             if end < SAME_COORDINATE:
@@ -216,7 +216,7 @@ class Solid:
             by_node = forces.reshape(face.N, -1, self.dim)
             by_dof = by_node.swapaxes(1, 2).reshape(len(self.component), -1)
             total = total + by_dof
-        return total
+        return np.asarray(total)
 
     def solve(self, parity: Parity, forces: Array) -> Array:
         """Return the displacements (dofs, n) under nodal forces (dofs, n) of one parity."""

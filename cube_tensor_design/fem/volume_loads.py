@@ -27,7 +27,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import skfem
@@ -65,7 +64,7 @@ class VolumeResponse:
     pads: Array
     change: float | None
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the content of the file of --json."""
         return {
             **vars(self),
@@ -77,7 +76,7 @@ class VolumeResponse:
 class ThermalStress(VolumeResponse):
     """Response to profiles of the temperature."""
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain types, as the simulator reads them from a file."""
         return {
             "layout": self.layout.name,

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from matplotlib.figure import Figure
 
@@ -39,7 +38,7 @@ def save_paper(folder: Path, report: Progress) -> list[Path]:
     # Each picture is written as soon as it is there: the whole takes many minutes.
     report(0, 1, PARTS[0])
     save_picture(draw_figure_4(figure_4()), "figure_4")
-    numbers: dict[str, Any] = {}
+    numbers: dict[str, object] = {}
     for law in ("linear", "finite"):
         report_law = _report_part(report, law)
         results = experiments(finite=law == "finite", progress=report_law)

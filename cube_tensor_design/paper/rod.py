@@ -14,11 +14,13 @@ is ours.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 import skfem
+from skfem.assembly.form.form import FormExtraParams
+from skfem.element import DiscreteField
 
 from cube_tensor_driver.core.arrays import Array
 
@@ -192,11 +194,7 @@ _PUSH = skfem.LinearForm(lambda w, p: p.pressure * (w[1] - p.slope * w[0]))
 """Linear form: work of the contact pressure along the rod's normal in a test function w."""
 
 
-def _push_change(
-    u: Any,
-    w: Any,
-    p: Any,
-) -> Any:
+def _push_change(u: DiscreteField, w: DiscreteField, p: FormExtraParams) -> Array:
     """Bilinear form: derivative of `_PUSH`, the work of the pressure, by the displacement u, which
     changes the penetration and the normal."""
     normal_w = w[1] - p.slope * w[0]

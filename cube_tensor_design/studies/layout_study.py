@@ -16,7 +16,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -98,7 +97,7 @@ class LayoutStudy:
         is_observed = ~np.isnan(error[:, 0])
         return np.where(is_observed, from_widest[n_trusted], np.nan)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the content of the file of --json; NaN becomes null there."""
         return {**vars(self), "depth": DEPTH, "components": COMPONENTS}
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -41,7 +41,7 @@ from cube_tensor_driver.mechanics.measurement_model import CubeMeasurement
 from cube_tensor_driver.touch.inverse import SurfaceInverse
 from cube_tensor_driver.touch.pad_measurement import model_pads
 from cube_tensor_driver.touch.pad_noise import compute_noise_of_all_pads
-from cube_tensor_driver.touch.surface import Surface
+from cube_tensor_driver.touch.surface import Contact, Surface
 from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker, TrackedContact
 
 from .field_study import (
@@ -423,7 +423,9 @@ class ContactErrors(NamedTuple):
     position_deviation: float
 
 
-def sum_contact_errors(contacts: Sequence[Any], centre: Array) -> ContactErrors:
+def sum_contact_errors(
+    contacts: Sequence[Contact | TrackedContact], centre: Array
+) -> ContactErrors:
     """Return the errors of contacts that are summed as if they were independent of each other.
 
     Args:

@@ -428,17 +428,16 @@ def _check_keys(
         )
 
 
-def _to_plain(value: Any, is_per_pad: bool) -> object:
+def _to_plain(value: object, is_per_pad: bool) -> object:
     """Return the value of an attribute in types that JSON has.
 
     Args:
         value: The value.
         is_per_pad: Whether it is an array with one value per pad; equal values become one number.
     """
-    if is_per_pad and not np.ptp(value):
-        return float(value[0])
     if isinstance(value, np.ndarray):
-        return value.tolist()
+        has_one_value = is_per_pad and not np.ptp(value)
+        return float(value[0]) if has_one_value else value.tolist()
     if isinstance(value, EffectModel):
         return value.to_dict()
     if isinstance(value, tuple):

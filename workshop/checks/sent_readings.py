@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -82,7 +81,7 @@ class Readings:
 class SentReadings:
     """Finds what the hubs sent for any cube in any sample."""
 
-    def __init__(self, samples: Samples, readings: Any) -> None:
+    def __init__(self, samples: Samples, readings: AnyArray) -> None:
         """Store the readings (S,), see `read_readings`, of all samples of the hubs."""
         self._samples, self._readings = samples, readings
         members = [link.cubes for link in samples.log.links]

@@ -6,9 +6,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cube_tensor_design.studies.pads_study import study_pads
 from cube_tensor_design.studies.traction_study import (
@@ -75,7 +75,7 @@ def write_contact_tables(
     write_json(path, tables)
 
 
-def compute_contact_tables(true_pads: Influence) -> dict[str, Any]:
+def compute_contact_tables(true_pads: Influence) -> dict[str, object]:
     """Run the studies and return their tables by name: 3 N press and 0.9 N rub."""
     balls = traction_study((*MAIN, *PITCHES), WIDTHS, BALL_LOADS, SEED)
     by_pitch = {
@@ -94,7 +94,7 @@ def compute_contact_tables(true_pads: Influence) -> dict[str, Any]:
     }
 
 
-def _make_table(results: Mapping[str, Sequence[Errors]], loads: int) -> dict[str, Any]:
+def _make_table(results: Mapping[str, Sequence[Errors]], loads: int) -> dict[str, object]:
     """Return the table of the errors of each skin and width, from a number of loads for each."""
     rows = {}
     for name, all_widths in results.items():
@@ -104,7 +104,7 @@ def _make_table(results: Mapping[str, Sequence[Errors]], loads: int) -> dict[str
     return {"loads in each row": loads, "rows": rows}
 
 
-def _round(values: Any) -> Any:
+def _round(values: ArrayLike) -> object:
     """Return a number, or an array as nested lists, with three significant digits."""
     rounded = [float(f"{value:.3g}") for value in np.ravel(values)]
     return np.reshape(rounded, np.shape(values)).tolist()

@@ -5,9 +5,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -86,7 +86,7 @@ def draw_fingers(
 
 
 def _draw_shear(
-    axis: Any,
+    axis: Axes,
     poses: CubePoses,
     kilopascal: Array,
 ) -> None:
