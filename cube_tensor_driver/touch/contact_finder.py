@@ -40,6 +40,22 @@ INVERSE = CONTACT_METHODS[2]
 """Method that fits the traction in each contact to the values of the cubes around it."""
 
 
+UNCERTAIN_PRESSURE = 1200.0
+"""Smallest pressure, in Pa at the depth of the cubes' centres, of a new contact above a cube with
+the status bit COMPENSATION, if the errors of the compensation are not stated.
+
+The compensated values of nine unloaded cubes 24 mm apart gave a pressure of up to 402 Pa when the
+ground warmed by 15 K within a minute. With a tare before, it was up to 860 Pa: the tare removes the
+error of the fit at rest, which cancels a part of the error while the ground warms. With smaller
+distances, the pressures were lower.
+"""
+
+CERTAIN_DEVIATIONS = 2.5
+"""Smallest pressure of a new contact, in standard deviations of the pressure that errors of the
+compensation cause. In the case of `UNCERTAIN_PRESSURE`, unloaded cubes gave 1.0 and 2.0 standard
+deviations at most."""
+
+
 @dataclass(frozen=True)
 class ContactSettings:
     """Settings of the search for contacts. The names are those of the node's parameters.
@@ -117,6 +133,7 @@ class ContactFinder(Protocol):
         left_out: PadMasks,
         status: StatusBits,
         touches: Touches = NO_TOUCHES,
+        errors: Array | None = None,
     ) -> None:
         """Find the contacts in the newest values.
 
@@ -125,9 +142,12 @@ class ContactFinder(Protocol):
             values: Components (cubes, 15) in Pa and Pa/m, NaN where unknown.
             left_out: Bit masks (cubes,), in which bit k is set if pad k (sensing element) of a cube
                 was not used for `values`.
-            status: Status bits (cubes,) of `values`. Where COMPENSATION is set, the method inverse
-                finds a new contact only if its pressure is above `UNCERTAIN_PRESSURE`.
+            status: Status bits (cubes,) of `values`.
             touches: Touches in the newest scan.
+            errors: Errors (cubes, 15, K) of the values other than noise, as from
+                `Reconstructor.errors`. With the method inverse, stated deviations contain them, and
+                a new contact needs a pressure of `CERTAIN_DEVIATIONS`. None: they are not known,
+                and a new contact where COMPENSATION is set needs `UNCERTAIN_PRESSURE`.
         """
 
     def follow(self, time_s: float, values: Array) -> bool:
@@ -196,6 +216,7 @@ class _InterpolationFinder:
         left_out: PadMasks,
         status: StatusBits,
         touches: Touches = NO_TOUCHES,
+        errors: Array | None = None,
     ) -> None:
         self.contacts = self._surface.contacts(values, self._threshold)
 
@@ -228,6 +249,7 @@ class _InverseFinder:
         by_pad = compute_noise_of_all_pads(calibrations)
         self._pipeline = Pipeline(calibrations)
         self._left_out = np.zeros(len(calibrations), np.uint32)
+        self._errors: Array | None = None
         self._inverse = SurfaceInverse.from_poses(
             poses,
             by_pad,
@@ -252,6 +274,7 @@ class _InverseFinder:
         left_out: PadMasks,
         status: StatusBits,
         touches: Touches = NO_TOUCHES,
+        errors: Array | None = None,
     ) -> None:
         # The noise of a cube's components depends on the pads in use. So the noise matrices are
         # computed again for cubes whose pads in use have changed since the last scan.
@@ -260,7 +283,15 @@ class _InverseFinder:
             by_pad = compute_noise_by_pad(self._pipeline, changed, left_out[changed])
             self._inverse.leave_out(changed, by_pad)
             self._left_out = left_out.copy()
-        self.contacts = self._tracker.update(values, status & COMPENSATION != 0)
+        if errors is not self._errors:
+            self._errors = errors
+            self._inverse.state_errors(errors)
+        if errors is None:
+            is_uncertain = status & COMPENSATION != 0
+            certain = np.where(is_uncertain, UNCERTAIN_PRESSURE, 0.0)[self._inverse.cube]
+        else:
+            certain = CERTAIN_DEVIATIONS * self._inverse.error_deviation
+        self.contacts = self._tracker.update(values, certain)
         self._slip.adopt(self.contacts, values)
         self._slip.update(time_s, values)
         self.touch_id = self._links.link(self.contacts, touches)

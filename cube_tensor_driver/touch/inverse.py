@@ -18,7 +18,7 @@ from ..config.skin import Elastomer, Skin, as_skin
 from ..core.arrays import Array, Index, Single
 from ..core.defaults import SURFACE_DEPTH
 from ..core.errors import ElasticError
-from ..core.modes import STRESS
+from ..core.modes import COMPONENTS, STRESS
 from ..core.poses import CubePoses
 from ..mechanics.contact_response import ContactResponse
 from ..mechanics.influence import Influence
@@ -37,6 +37,10 @@ MAX_PITCH_OF_FOUR_POINTS = 3.25
 patch of a cube has 2 x 2 points. With a larger pitch it has 3 x 3 points, one of them above the
 cube. At a pitch of 4 depths, 2 x 2 points were not enough: a ball that pressed with 0.3 N above a
 cube, between the four points, was not found."""
+
+MIN_ERROR_CHANGE = 0.1
+"""Smallest change of an error of the values other than noise, divided by the largest error, after
+which errors are stated again, because the noise of all cubes is then computed again."""
 
 
 class TractionField(NamedTuple):
@@ -95,7 +99,9 @@ class SurfaceInverse:
         variant: Index (cubes,) of each cube's variant (calibration and pads in use) in the
             measurement model.
         near: Indices (cubes, W) of the cubes nearest to each cube, which itself comes first.
-        revision: Number that increases when `leave_out` changes the pads in use.
+        errors: Errors (cubes, C, K) of the values other than noise, by K independent causes, in Pa.
+        revision: Number that increases when `leave_out` changes the pads in use, or `state_errors`
+            the errors.
     """
 
     def __init__(
@@ -258,6 +264,8 @@ class SurfaceInverse:
         self.near = self._windows.near
         self._known = self.observed
         self._prediction = MissingValuePrediction(self._windows, self.observed, self._known)
+        self.errors = np.zeros((n, len(self.columns), 0))
+        self._error_variance = np.zeros((len(self.points), 2))
 
     def scaled(self, values: Array) -> Array:
         """Select the components that some cube of the skin observes, and convert them to Pa.
@@ -316,6 +324,39 @@ class SurfaceInverse:
             self._has_other_pads[cube] = not np.array_equal(
                 self.by_pad[cube], self._all_pads[cube], equal_nan=True
             )
+
+    def state_errors(self, errors: Array | None) -> None:
+        """Set the errors of the values other than noise. They do not change the traction field.
+
+        Errors that differ little from those in use (`MIN_ERROR_CHANGE`) are ignored.
+
+        Args:
+            errors: Errors (cubes, 15, K) by K independent causes, in Pa and Pa/m, as from
+                `Reconstructor.errors`; None: there are none.
+        """
+        if errors is None:
+            errors = np.zeros((len(self.observed), len(COMPONENTS), 0))
+        known = self._known[:, :, None]
+        scaled = errors[:, self.columns] * self._unit_factors[:, None]
+        scaled = np.where(known, np.nan_to_num(scaled), 0.0)
+        scaled = scaled[:, :, scaled.any(axis=(0, 1))]
+        if scaled.shape == self.errors.shape:
+            limit = MIN_ERROR_CHANGE * np.abs(scaled).max(initial=0.0)
+            if np.abs(scaled - self.errors).max(initial=0.0) <= limit:
+                return
+        self.errors = scaled
+        self.revision += 1
+        # A cause changes the values of all cubes together.
+        self._error_variance = np.zeros((len(self.points), 2))
+        for column in np.moveaxis(scaled, 2, 0):
+            field = self.field_of_scaled(np.where(self._known, column, np.nan))
+            self._error_variance += np.stack([field.pressure, field.depth_pressure], axis=1) ** 2
+
+    @property
+    def error_deviation(self) -> Array:
+        """Standard deviation (M,) of the pressure at the depth of the cubes, in Pa, by the errors
+        that `state_errors` has set."""
+        return np.sqrt(self._error_variance[:, 1])
 
     def field(self, values: Array) -> TractionField:
         """Compute the traction that explains the values of all cubes.
@@ -388,6 +429,7 @@ class SurfaceInverse:
         variance = scale[:, None] * prior
         variance += windows.noise(pad_variance)
         variance += self._prediction.noise(pad_variance)
+        variance += self._error_variance.reshape(variance.shape)
         deviation = np.sqrt(variance)
         on_surface, at_depth = deviation.reshape(-1, 2).T
         return FieldDeviation(on_surface, at_depth)

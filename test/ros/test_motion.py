@@ -44,6 +44,7 @@ from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
 from cube_tensor_driver.ros.messages import to_ns, to_time
 from cube_tensor_driver.ros.motion import _decode
+from cube_tensor_driver.ros.nodes.contacts import Contacts
 from cube_tensor_driver.ros.nodes.reconstruction import Reconstruction
 
 START_NS = 1_700_000_000_000_000_000
@@ -148,10 +149,12 @@ def start(ros, skin_file, tmp_path):
         assert node.is_active
         node._compensation = Published()
         node._publisher._publisher = Published()
+        node._publisher._errors._publisher = Published()
         node.sent = {
             "info": info.sent,
             "compensation": node._compensation.sent,
             "stress": node._publisher._publisher.sent,
+            "errors": node._publisher._errors._publisher.sent,
         }
         return node
 
@@ -467,6 +470,29 @@ def test_what_nobody_records_is_not_sent_but_compensated(start, monkeypatch):
     assert len(node._motion._samples) <= 8
     stress = [stress_codec.decode(one).rows for one in node.sent["stress"]]
     assert all((rows.status & WEIGHT).all() for rows in stress)
+
+
+def test_the_errors_of_the_stress_are_sent_twice_a_second_and_when_they_grow(start, monkeypatch):
+    fake_tf(monkeypatch, imu=IMU_FRAME)
+    node, contacts = start(imu="/imu"), SimpleNamespace(_errors=None)
+    node.on_rows(scan_at(0.0))  # without an IMU
+    node.on_rows(scan_at(0.004))
+    (unknown,) = node.sent["errors"]
+    Contacts._on_errors(contacts, unknown)
+    found = Contacts._find_errors(contacts, 2)
+    matrix = node._reconstructor.pipeline.matrix(0)
+    expected = matrix @ (illustrative("planar").gain[:, None] * RESPONSE * G)
+    np.testing.assert_allclose(found[0, :, :3], expected, rtol=1e-5)
+    assert Contacts._find_errors(contacts, 3) is None
+    played(node, MovingSkin(), 1.1)
+    assert len(node.sent["errors"]) == 3
+    assert not np.nan_to_num(np.array(node.sent["errors"][-1].data)).any()
+    node._motion._samples.clear()
+    node.on_rows(scan_at(1.2))
+    assert len(node.sent["errors"]) == 4
+    node = start()
+    node.on_rows(scan_at(0.0))
+    assert not node.sent["errors"]
 
 
 def test_the_weight_of_a_simulated_arm_that_moves_is_subtracted(ros, tmp_path, skin_file):

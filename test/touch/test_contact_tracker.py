@@ -509,7 +509,7 @@ def test_a_new_contact_above_uncertain_cubes_needs_more_pressure(inverse):
     """The field at the depth of the cubes has 0.83, 1.00 and 1.66 kPa under these forces."""
     forces = (0.2, 0.24, 0.4)
     light, kept, firm = (ball(inverse, 4e-3, (0, 0), (0, 0, -force)) for force in forces)
-    uncertain = np.ones(COUNT**2, bool)
+    uncertain = np.full(len(inverse.points), 1200.0)
     tracker = ContactTracker(inverse, LEAST)
     assert not tracker.update(kept, uncertain)
     (begun,) = tracker.update(kept)
@@ -518,6 +518,6 @@ def test_a_new_contact_above_uncertain_cubes_needs_more_pressure(inverse):
     assert not tracker.update(light, uncertain) and not tracker.update(kept, uncertain)
     (found,) = tracker.update(firm, uncertain)
     assert found.normal_force == pytest.approx(0.4, rel=0.05)
-    uncertain[COUNT**2 // 2] = False
+    uncertain[inverse.cube == COUNT**2 // 2] = 0.0
     (above_certain,) = ContactTracker(inverse, LEAST).update(light, uncertain)
     assert above_certain.normal_force == pytest.approx(0.2, rel=0.05)

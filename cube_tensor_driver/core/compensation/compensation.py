@@ -42,6 +42,7 @@ class Compensation:
 
     Attributes:
         creep: Compensation of creep, which a tare needs.
+        is_active: Whether an effect was subtracted from the newest rows.
         offsets: Values that are subtracted, and the newest row of each cube.
     """
 
@@ -76,6 +77,7 @@ class Compensation:
         with_history = self._thermal, self.creep
         self._lasting = [effect for effect in with_history if effect.has_model.any()]
         self._has_forces = False
+        self.is_active = False
 
     def process(
         self,
@@ -92,7 +94,7 @@ class Compensation:
         The arguments are those of `Pipeline.process`.
         """
         self._has_forces = rows.specific_force is not None
-        is_active = self._has_forces or bool(self._lasting)
+        is_active = self.is_active = self._has_forces or bool(self._lasting)
         if is_active and self.creep.follow_rest():
             self.offsets.step_ns[:] = 0
         self._pipeline.newest_offset = self.offsets.subtracted if is_active else None

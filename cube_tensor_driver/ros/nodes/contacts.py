@@ -14,9 +14,11 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.publisher import Publisher
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Float32MultiArray
 
 from ...config.parameters import CONTACTS
-from ...core.arrays import Index
+from ...core.arrays import Array, Index
+from ...core.modes import COMPONENTS
 from ...messages.contacts import make_contacts_message, make_traction_message
 from ...messages.skin_info import read_cube_calibrations, read_skin_elastomer
 from ...msg import SkinContacts, SkinTouch
@@ -31,6 +33,10 @@ from ..skin_subscriber import FollowedSkin, SkinSubscriberNode
 RETRY_PERIOD_S = 5.0
 """Time, in seconds, from a failed set-up of the contact finder to the next attempt. It may succeed
 then, because a missing or damaged file may have been replaced."""
+
+MAX_ERRORS_AGE_S = 5.0
+"""Age of the newest message of `stress_errors`, in seconds, from which on the errors of the stress
+count as unknown. Usually the messages are half a second apart."""
 
 
 class Contacts(SkinSubscriberNode):
@@ -61,6 +67,9 @@ class Contacts(SkinSubscriberNode):
         self._touch = b""
         touch = self.create_subscription(SkinTouch, "touch", self._on_touch, NEWEST, raw=True)
         self.own(touch)
+        self._errors: Array | None = None
+        self._errors_s = 0.0
+        self.own(self.create_subscription(Float32MultiArray, "stress_errors", self._on_errors, 2))
         super().configure()
 
     def has_listeners(self, publisher: Publisher) -> bool:
@@ -100,6 +109,7 @@ class Contacts(SkinSubscriberNode):
             newest.left_out,
             newest.status,
             self._read_touches(),
+            self._find_errors(len(values)),
         )
         # Computing the point cloud takes time, so it is done only while somebody subscribes.
         if self._has_traction_listeners():
@@ -113,6 +123,19 @@ class Contacts(SkinSubscriberNode):
                 )
                 self._traction.publish(message)
         return self._make_message(skin, finder)
+
+    def _on_errors(self, message: Float32MultiArray) -> None:
+        shape = [dimension.size for dimension in message.layout.dim]
+        self._errors = np.array(message.data, float).reshape(shape)
+        self._errors_s = time.monotonic()
+
+    def _find_errors(self, n_cubes: int) -> Array | None:
+        """Return the newest errors of the stress; None if they are not published for this skin."""
+        errors = self._errors
+        is_old = time.monotonic() - self._errors_s > MAX_ERRORS_AGE_S
+        if errors is None or is_old or errors.shape[:2] != (n_cubes, len(COMPONENTS)):
+            return None
+        return errors
 
     def follow_stress(
         self,

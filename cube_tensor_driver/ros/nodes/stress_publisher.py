@@ -3,11 +3,12 @@
 """Publishes stress rows (the stress of one cube at one instant each) on several topics.
 
 All rows go to `stress`, forces of all cubes to `forces`, and the rows of single cubes to
-`cubes/<name>/stress` and `cubes/<name>/wrench`.
+`cubes/<name>/stress` and `cubes/<name>/wrench`. Errors other than noise go to `stress_errors`.
 """
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 
 import numpy as np
@@ -15,16 +16,16 @@ from geometry_msgs.msg import WrenchStamped
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import Header
+from std_msgs.msg import Float32MultiArray, Header, MultiArrayDimension
 
 from ...config.skin import Skin
 from ...core.arrays import Array
 from ...core.forces import Forces
 from ...core.reconstructor import Reconstructor
 from ...core.rows import FrequencyRows, StressRows
-from ...core.status import INVALID
+from ...core.status import COMPENSATION, INVALID
 from ...core.tensor import contact_wrench
-from ...messages.codec import stress_codec
+from ...messages.codec import SECOND, stress_codec
 from ...messages.point_cloud import make_cloud_message
 from ...msg import SkinStress, StressTensorStamped
 from ..messages import make_message, make_tensor_message, make_wrench_message, pack_array, to_time
@@ -49,6 +50,11 @@ CUBE_TOPIC_DEPTH = 10
 FORCE_FIELDS = ("x", "y", "z", "fx", "fy", "fz")
 """Names of the float32 fields of a point in the point cloud `forces`: position of the cube, in m,
 and force on it, in N, both in the parent frame of the skin."""
+
+
+ERRORS_PERIOD_NS = SECOND // 2
+"""Longest time, in ns, between two messages of `stress_errors`. A message comes earlier if the
+compensation of a cube becomes uncertain (status bit COMPENSATION)."""
 
 
 class StressPublisher:
@@ -85,6 +91,7 @@ class StressPublisher:
             forces.side,
         )
         self._forces = ForceCloud(node, skin, profile, forces) if with_forces else None
+        self._errors = ErrorPublisher(node, reconstructor)
         node.own(node.create_timer(LISTENERS_PERIOD_S, self._cubes.find_listeners))
 
     def make_rows(self, rows: FrequencyRows, frame_id: bytes) -> StressRows:
@@ -112,10 +119,57 @@ class StressPublisher:
             stamp_ns: Stamp of the message, in ns since the Unix epoch.
         """
         stress = self._message.rows
+        # The errors come first, so that nobody takes the stress for more certain than it is.
+        self._errors.publish(stress, stamp_ns)
         self._publisher.publish(self._message.data(stamp_ns))
         self._cubes.publish(stress)
         if self._forces is not None:
             self._forces.publish(stress, stamp_ns)
+
+
+class ErrorPublisher:
+    """Publishes `stress_errors`, errors of the newest stress of all cubes other than noise.
+
+    Its array is that of `Reconstructor.errors`. It is published only while something is compensated
+    or drift is followed, and while it has subscribers.
+    """
+
+    def __init__(self, node: CubeNode, reconstructor: Reconstructor) -> None:
+        self._reconstructor = reconstructor
+        self._publisher = node.own(
+            node.create_lifecycle_publisher(Float32MultiArray, "stress_errors", 2)
+        )
+        self._cubes = np.arange(len(reconstructor.names))
+        self._left_out = np.zeros(len(self._cubes), np.uint32)
+        self._is_uncertain = np.zeros(len(self._cubes), bool)
+        self._last_ns = 0
+
+    def publish(self, rows: StressRows, stamp_ns: int) -> None:
+        """Publish the errors if they are due (`ERRORS_PERIOD_NS`).
+
+        Args:
+            rows: Rows of stress, one cube at one sampling time each.
+            stamp_ns: Stamp of their message, in ns since the Unix epoch.
+        """
+        reconstructor = self._reconstructor
+        if not (reconstructor.compensation.is_active or reconstructor.drift_time):
+            return
+        self._left_out[rows.cube] = rows.left_out
+        is_uncertain = self._is_uncertain.copy()
+        is_uncertain[rows.cube] = rows.status & COMPENSATION > 0
+        is_worse = is_uncertain & ~self._is_uncertain
+        is_due = abs(stamp_ns - self._last_ns) >= ERRORS_PERIOD_NS or is_worse.any()
+        if not is_due or not self._publisher.get_subscription_count():
+            return
+        self._last_ns = stamp_ns
+        self._is_uncertain = is_uncertain
+        errors = reconstructor.errors(self._cubes, self._left_out).astype(np.float32)
+        message = Float32MultiArray(data=pack_array("f", errors))
+        labels = "cube", "component", "cause"
+        for axis, (label, size) in enumerate(zip(labels, errors.shape, strict=True)):
+            stride = math.prod(errors.shape[axis:])
+            message.layout.dim.append(MultiArrayDimension(label=label, size=size, stride=stride))
+        self._publisher.publish(message)
 
 
 class ForceCloud:

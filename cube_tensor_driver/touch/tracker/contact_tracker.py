@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from ...core.arrays import Array, Index, Mask
+from ...core.arrays import Array, Index
 from ..inverse import FieldDeviation, SurfaceInverse, TractionField
 from ..surface import describe_contact
 from .contact_estimate import ContactEstimate
@@ -136,7 +136,7 @@ class ContactTracker:
     def update(
         self,
         values: Array,
-        uncertain: Mask | None = None,
+        certain: Array | None = None,
         *,
         max_work: float = MAX_WORK_PER_SCAN,
     ) -> list[TrackedContact]:
@@ -144,8 +144,8 @@ class ContactTracker:
 
         Args:
             values: Components (cubes, 15) in Pa and Pa/m, NaN where unknown.
-            uncertain: Whether the compensation of each cube is uncertain, so that a new contact
-                needs `UNCERTAIN_PRESSURE`; None: of no cube.
+            certain: Smallest pressure (M,), in Pa at the depth of the cubes, that is certain to be
+                a contact, below each point of the surface; None: 0.
             max_work: Computing work in ms (`MAX_WORK_PER_SCAN`). 0: no fit is made or improved.
                 Infinite: all fits are improved as far as possible.
 
@@ -155,7 +155,7 @@ class ContactTracker:
         inverse = self._inverse
         scaled = inverse.scaled(values)
         self._scaled = scaled
-        self._follow_regions(inverse.depth_pressure_of_scaled(scaled), uncertain)
+        self._follow_regions(inverse.depth_pressure_of_scaled(scaled), certain)
         regions = self._regions
         self._noise.update(scaled, self._fitted_cubes)
         for region in regions:
@@ -239,7 +239,7 @@ class ContactTracker:
             total = total + region.response
         return np.asarray(total)
 
-    def _follow_regions(self, pressure: Array, uncertain: Mask | None) -> None:
+    def _follow_regions(self, pressure: Array, certain: Array | None) -> None:
         """Find the regions of the newest scan, and match them with those of the previous scan.
 
         A matched region keeps its fit.
@@ -247,9 +247,9 @@ class ContactTracker:
         Args:
             pressure: Pressure (M,) in Pa at the depth of the cubes' centres, below each of the M
                 points of the surface.
-            uncertain: Whether the compensation of each cube is uncertain; None: of no cube.
+            certain: Smallest pressure (M,), in Pa, that is certain to be a contact; None: 0.
         """
-        found = self._pressure_regions.find(pressure, uncertain)[:MAX_REGIONS]
+        found = self._pressure_regions.find(pressure, certain)[:MAX_REGIONS]
         owner = np.full(len(pressure), len(self._regions))
         for number, region in enumerate(self._regions):
             owner[region.points] = number

@@ -141,6 +141,8 @@ class CubeNoise:
         weighted = by_pad * variance[:, None]
         covariance = weighted @ by_pad.swapaxes(1, 2)
         is_known = self.known[cubes]
+        errors = self._inverse.errors[cubes] * is_known[:, :, None]
+        covariance += errors @ errors.swapaxes(1, 2)
         covariance = regularise(covariance, is_known)
         cholesky_factor = np.linalg.cholesky(covariance)
         whitening = np.linalg.inv(cholesky_factor)

@@ -23,16 +23,6 @@ RELEASE_FRACTION = 0.75
 belonged to a contact in the previous scan (set of values of all cubes). This hysteresis keeps noise
 from changing the regions of contact in every scan."""
 
-UNCERTAIN_PRESSURE = 1200.0
-"""Smallest pressure, in Pa at the depth of the cubes' centres, of a new contact above a cube whose
-compensation is uncertain (status bit COMPENSATION).
-
-The compensated values of nine unloaded cubes 24 mm apart gave a pressure of up to 402 Pa when the
-ground warmed by 15 K within a minute. With a tare before, it was up to 860 Pa: the tare removes the
-error of the fit at rest, which cancels a part of the error while the ground warms. With smaller
-distances, the pressures were lower.
-"""
-
 JOIN_PITCHES = 1.25
 """Largest distance of two regions of contact, divided by the pitch (distance of neighbouring
 cubes), at which they are fitted as one region, because the same cubes measure both."""
@@ -77,13 +67,14 @@ class PressureRegions:
     def find(
         self,
         pressure: Array,
-        uncertain: Mask | None = None,
+        certain: Array | None = None,
     ) -> list[Index]:
         """Find the regions in the newest scan.
 
         Args:
             pressure: Pressure (M,) in Pa at the depth of the cubes, below all points.
-            uncertain: Whether the compensation of each cube is uncertain; None: of no cube.
+            certain: Smallest pressure (M,), in Pa, that is certain to be a contact, below each
+                point. A region needs a point with a larger one. None: 0 at all points.
 
         Returns:
             Indices of the points of each region, the region with the largest pressure first.
@@ -96,10 +87,8 @@ class PressureRegions:
         self._inside = pressure > limits
         if not np.array_equal(self._inside, before):
             self._regions = self._connect_points()
-        if uncertain is not None and uncertain.any():
-            min_pressure = np.where(uncertain[self._cube], UNCERTAIN_PRESSURE, 0.0)
-            min_release = RELEASE_FRACTION * min_pressure
-            is_certain = pressure > np.where(before, min_release, min_pressure)
+        if certain is not None:
+            is_certain = pressure > np.where(before, RELEASE_FRACTION * certain, certain)
             for region in self._regions:
                 self._inside[region] = is_certain[region].any()
             self._regions = [region for region in self._regions if self._inside[region[0]]]
