@@ -118,7 +118,8 @@ def test_the_latency_of_touch_counts_from_its_own_sample(error_ns):
     touches = np.column_stack([sampled_ns + error_ns, sampled_ns + 2_000_000])
     span = SimpleNamespace(start_ns=10**18 + 100_500_000, end_ns=10**18 + 899_500_000)
     taken = SimpleNamespace(time_ns=rng.permutation(sampled_ns))
-    found = bench._summarise_touches(touches, taken, span)
+    settings = bench.Bench(1000.0, 1.0, topic="touch")
+    found = bench._summarise_found(settings, touches, taken, span)
     assert found == {
         "touch_messages": 799,
         "touch_latency_p50_ms": 2.0,

@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""`./cube bench contacts`: errors and CPU time of contacts by the shape of the load.
+"""`./cube bench contacts`: errors and CPU time of contacts by the shape of the load (in process).
 
 The stress is that of point forces on a half space. It goes through the whole chain: pads whose
 gains are known to 1 %, the pad law, a counter's noise, the pipeline. The estimator uses none of it.
@@ -16,13 +16,11 @@ import numpy as np
 
 from cube_tensor_design.studies.field_study import (
     FORCE,
-    FRICTION,
     compute_field_below,
     draw_force,
 )
 from cube_tensor_design.studies.traction_study import (
     CUBES,
-    GAIN_ERROR,
     ContactErrors,
     Setting,
     TractionBench,
@@ -40,18 +38,6 @@ SCANS = 12
 
 Errors are those after the last scan. CPU times are given for the first and for the last scan.
 """
-
-MOVING_SCANS = 120
-"""Number of scans while balls move over the skin."""
-
-RATE_HZ = 100.0
-"""Sampling rate of the balls that move, in Hz."""
-
-SPEED = 50e-3
-"""Speed of the balls that move, in m/s."""
-
-RADIUS_M = 12e-3
-"""Radius in m of the circle on which each ball moves."""
 
 SEED = 11
 """Seed of the random loads."""
@@ -263,42 +249,3 @@ def _summarise(name: str, loads: list[TrackingResult]) -> dict[str, float]:
 def _compute_rms(values: Array) -> float:
     """Return the root mean square of the values that are not NaN."""
     return float(np.sqrt(np.nanmean(values**2)))
-
-
-def bench_moving_balls() -> dict[str, dict[str, float]]:
-    """Measure the CPU time of a scan while four balls begin, move at 50 mm/s and end."""
-    return {f"four balls that move, 289 {cubes} cubes": _bench_moving(cubes) for cubes in CUBES[:2]}
-
-
-def _bench_moving(cubes: str) -> dict[str, float]:
-    setting = Setting(cubes=cubes, side=0.128, gain_error=0.0)
-    bench = TractionBench(setting, side=2)
-    random = np.random.default_rng(3)
-    count = (len(bench.poses.position), len(bench.calibration.noise))
-    gain = 1 + GAIN_ERROR * random.standard_normal(count)
-    shape = ellipse(6e-3, 6e-3, order=6)
-    tracker = ContactTracker(bench.inverse, CONTACT_PRESSURE)
-    corners = 28e-3 * np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
-    times_ms, errors = [], []
-    for scan in range(MOVING_SCANS):
-        pads, pressing = np.zeros(count), 0.0
-        for number, corner in enumerate(corners):
-            # Every ball begins 15 scans after the one before, and takes 10 scans to full force.
-            since, until = scan - 15 * number - 5, MOVING_SCANS - 10 * number - scan
-            share = float(np.clip(min(since, until) / 10, 0, 1))
-            angle = since / RATE_HZ * SPEED / RADIUS_M
-            centre = corner + RADIUS_M * np.array([np.cos(angle), np.sin(angle)])
-            force = share * FORCE * np.array([FRICTION, 0.0, -1.0])
-            pads = pads + _compute_pads_under(bench, shape, centre, force)
-            pressing += share * FORCE
-        values = bench.measured(pads * gain, random)
-        start_s = time.process_time()
-        found = tracker.update(values)
-        times_ms.append(1e3 * (time.process_time() - start_s))
-        if pressing > 3.9 * FORCE:
-            errors.append(sum(one.normal_force for one in found) / pressing - 1)
-    return {
-        "scan_cpu_mean_ms": float(np.mean(times_ms)),
-        "scan_cpu_p99_ms": float(np.percentile(times_ms, 99)),
-        "force_error_percent": float(100 * np.sqrt(np.mean(np.square(errors)))),
-    }

@@ -69,11 +69,16 @@ class HubLoad:
         return self.hubs * self.cubes_per_hub
 
     def write_skin(self, folder: Path, rate: float) -> Path:
-        """Write the file of a skin of these hubs, sampled `rate` times a second."""
+        """Write the file of a skin of these hubs, as square as possible, and return its path.
+
+        Each cube is sampled `rate` times a second.
+        """
         path = folder / "skin.yaml"
+        sides = range(1, math.isqrt(self.cubes) + 1)
+        side = max(side for side in sides if self.cubes % side == 0)
         data = describe_grid(
-            nx=self.cubes,
-            ny=1,
+            nx=self.cubes // side,
+            ny=side,
             links=self.hubs,
             rate=rate,
             layout=LAYOUTS[self.pads],

@@ -1,9 +1,9 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""`./cube bench skin`, `echo`, `touch` and `scale`: the whole chain beside a bare floor.
+"""`./cube bench skin`, `echo`, `touch`, `contacts` and `scale`: the whole chain in real processes.
 
-The floor is measured in the same run. Everything runs in a DDS domain of its own, so that a skin
-that runs elsewhere is not disturbed.
+`skin` and `scale` also measure a bare floor in the same run. Everything runs in a DDS domain of
+its own, so that a skin that runs elsewhere is not disturbed.
 """
 
 from __future__ import annotations
@@ -30,18 +30,25 @@ from cube_tensor_driver.demo.running import observing
 from cube_tensor_driver.demo.usage import Usage
 from cube_tensor_driver.demo.verification import compare, percentile
 from cube_tensor_driver.messages.codec import stress_codec
-from cube_tensor_driver.msg import SkinStress, SkinTouch
+from cube_tensor_driver.msg import SkinContacts, SkinStress, SkinTouch
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.domain import own_domain
 from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
 from cube_tensor_driver.ros.qos import batch_profile
-from cube_tensor_driver.simulation.sample_log import SampleTable
+from cube_tensor_driver.simulation.sample_log import SampleLog, SampleTable
 from cube_tensor_driver.views.figures.style import save
 
 from ..torture.memory import compute_median_slope
+from .balls import write_balls
 from .hub_arrivals import HubArrivals
 from .hubs_in_c import HubLoad, read_samples
 from .scale import draw_scale
+
+FOUND = {"touch": SkinTouch, "contacts": SkinContacts}
+"""Topics with what presses on the skin -> type of their messages."""
+
+MAX_CONTACT_RATE_HZ = 100.0
+"""Largest value of the parameter `rate` of the node `contacts`."""
 
 LOAD = "hubs"
 """Name of the process that sends the samples. It is not part of what a robot runs."""
@@ -76,7 +83,9 @@ class Bench:
         publish_period: Time that one message covers, in seconds; 0: one message for each scan.
         composed: Whether driver and reconstruction run in one process.
         pads: Number of pads of each cube, 8 or 24.
-        finds_touch: Whether the reconstruction also publishes `touch`.
+        topic: The topic of `FOUND` whose latency is measured; empty: none.
+        has_load: Whether balls move over the skin. Then the simulator in Python sends the samples
+            instead of hubs in C, whose frequencies stay the same.
     """
 
     rate: float
@@ -84,7 +93,8 @@ class Bench:
     publish_period: float = 0.0
     composed: bool = False
     pads: int = 8
-    finds_touch: bool = False
+    topic: str = ""
+    has_load: bool = False
 
 
 @dataclass(frozen=True)
@@ -125,22 +135,24 @@ def bench_skin(cubes: int, bench: Bench) -> dict[str, Any]:
         return _measure_both(cubes, bench, progress)
 
 
-def bench_touch(cubes: int, bench: Bench) -> dict[str, Any]:
-    """Measure the latency of `touch`, and the processor time that finding touches costs.
+def bench_found(cubes: int, bench: Bench) -> dict[str, Any]:
+    """Measure the latency of `bench.topic`, and the processor time that it costs.
 
-    Driver and reconstruction run once without and once with it, both with a subscriber of `stress`.
+    The skin runs once without and once with a subscriber of it, both with one of `stress`.
     """
+    topic = bench.topic
     with _prepared() as progress:
-        without = _measure_skin(cubes, bench, progress)
-        touch = _measure_skin(cubes, replace(bench, finds_touch=True), progress)
+        without = _measure_skin(cubes, replace(bench, topic=""), progress)
+        found = _measure_skin(cubes, bench, progress)
+    chosen = {name: value for name, value in found.items() if name.startswith(("cpu_", topic))}
     cpu = {name: value for name, value in without.items() if name.startswith("cpu_")}
     return {
-        "cubes": cubes,
+        "cubes": HubLoad.of(cubes, bench.pads).cubes,
         "rate_hz": bench.rate,
         "duration_s": bench.duration,
-        **{name: value for name, value in touch.items() if "touch" in name or name in cpu},
-        "latency_p99_ms_without_touch": without["latency_p99_ms"],
-        **{f"{name}_without_touch": value for name, value in cpu.items()},
+        **chosen,
+        f"latency_p99_ms_without_{topic}": without["latency_p99_ms"],
+        **{f"{name}_without_{topic}": value for name, value in cpu.items()},
     }
 
 
@@ -205,20 +217,20 @@ def _measure_skin(
         path = load.write_skin(folder, bench.rate)
         processes = _make_processes(path, log, load, bench)
         arrivals = HubArrivals(read_skin(path))
-        touches: list[tuple[int, int]] = []
+        found: list[tuple[int, int]] = []
 
         def receive(data: bytes) -> None:
             arrivals.add(stress_codec.decode(data).rows, time.time_ns())
 
-        def receive_touch(data: bytes) -> None:
+        def receive_found(data: bytes) -> None:
             # The stamp stands behind the four bytes that state the encoding.
             seconds, nanoseconds = struct.unpack_from("<iI", data, 4)
-            touches.append((10**9 * seconds + nanoseconds, time.time_ns()))
+            found.append((10**9 * seconds + nanoseconds, time.time_ns()))
 
         with Children(folder) as children:
             name = f"skin of {load.cubes} cubes"
-            measured = _measure(processes, children, bench, receive, progress, name, receive_touch)
-            taken, skipped = _end_load(children, log, load)
+            measured = _measure(processes, children, bench, receive, progress, name, receive_found)
+            taken, skipped = _end_load(children, log, load, bench)
     # Only rows of the first cube of each hub were stored, because storing all would delay this
     # process. They are counted for all cubes of the hub.
     comparison = compare(taken, arrivals, measured.start_ns, measured.end_ns)
@@ -235,31 +247,32 @@ def _measure_skin(
         **{f"cpu_{name}_percent": round(value, 1) for name, value in cpu.items()},
         **summarise_memory(measured.memory_mb),
         "first_tensor_s": round(measured.first_tensor_s, 2),
-        **(_summarise_touches(np.array(touches), taken, measured) if bench.finds_touch else {}),
+        **(_summarise_found(bench, np.array(found), taken, measured) if bench.topic else {}),
     }
 
 
-def _summarise_touches(
-    touches: Index, taken: SampleTable, measured: Measurement
+def _summarise_found(
+    bench: Bench, found: Index, taken: SampleTable, measured: Measurement
 ) -> dict[str, float]:
-    """Return number and latencies of the messages of `touch`, which have no sequence number.
+    """Return number and latencies of the messages of a topic that has no sequence number.
 
     Args:
-        touches: Stamps and times of arrival (N, 2), in ns since the Unix epoch.
+        bench: Settings with the name of the topic.
+        found: Stamps and times of arrival (N, 2), in ns since the Unix epoch.
         taken: The samples that the hubs took.
         measured: Span of the measurement.
     """
     sampled_ns = np.sort(taken.time_ns)
-    stamp_ns, arrival_ns = touches.T
+    stamp_ns, arrival_ns = found.T
     # A stamp is closer to its own sample than to any other scan.
     after = np.searchsorted(sampled_ns, stamp_ns).clip(1, len(sampled_ns) - 1)
     is_earlier = stamp_ns - sampled_ns[after - 1] < sampled_ns[after] - stamp_ns
     latency_ms = 1e-6 * (arrival_ns - sampled_ns[after - is_earlier])
     latency_ms = latency_ms[(stamp_ns > measured.start_ns) & (stamp_ns < measured.end_ns)]
     return {
-        "touch_messages": len(latency_ms),
-        "touch_latency_p50_ms": percentile(latency_ms, 50),
-        "touch_latency_p99_ms": percentile(latency_ms, 99),
+        f"{bench.topic}_messages": len(latency_ms),
+        f"{bench.topic}_latency_p50_ms": percentile(latency_ms, 50),
+        f"{bench.topic}_latency_p99_ms": percentile(latency_ms, 99),
     }
 
 
@@ -271,22 +284,31 @@ def _make_processes(
 ) -> list[Process]:
     """Return the process of the load (hubs that send samples), followed by those of the nodes."""
     ports = path.parent / "ports"
+    balls = write_balls(path.parent) if bench.has_load else None
     processes = skin_processes(
         path,
         publish_period=bench.publish_period,
         composed=bench.composed,
-        simulated=SimulatedHubs(ports),
+        contacts=bench.topic == "contacts",
+        simulated=SimulatedHubs(ports, balls, sample_log=log, noise=None),
     )
-    processes[0] = load.make_process(path.parent / "firmware", ports, bench.rate, log)
-    if bench.finds_touch:
-        for process in processes[1:]:
-            process.parameters["touch_false_alarms"] = 1.0
+    if bench.has_load:
+        processes[0] = replace(processes[0], executable=LOAD)
+    else:
+        processes[0] = load.make_process(path.parent / "firmware", ports, bench.rate, log)
+    if bench.topic == "contacts":
+        processes[-1].parameters["rate"] = min(bench.rate, MAX_CONTACT_RATE_HZ)
     return processes
 
 
-def _end_load(children: Children, log: Path, load: HubLoad) -> tuple[SampleTable, int]:
+def _end_load(
+    children: Children, log: Path, load: HubLoad, bench: Bench
+) -> tuple[SampleTable, int]:
     """End the hubs; return their samples, and the number that they dropped from full queues."""
     children.end([LOAD])
+    if bench.has_load:
+        samples = SampleLog.read(log)
+        return samples.table, samples.dropped
     # The program prints how many samples it took and dropped when it ends.
     dropped = re.findall(r" taken, (\d+) dropped", children.log(LOAD))
     return read_samples(log, load), sum(map(int, dropped))
@@ -323,7 +345,7 @@ def _measure(
     receive: Callable[[bytes], None],
     progress: Progress,
     description: str,
-    receive_touch: Callable[[bytes], None] | None = None,
+    receive_found: Callable[[bytes], None] | None = None,
 ) -> Measurement:
     """Start the processes, wait for the first tensors and measure.
 
@@ -335,7 +357,7 @@ def _measure(
             than what is measured.
         progress: Shows how far the measurement is.
         description: Name of the measurement.
-        receive_touch: Called with each message of `touch`, if there are any.
+        receive_found: Called with each message of `bench.topic`.
 
     Raises:
         CubeError: No tensor arrived.
@@ -357,8 +379,9 @@ def _measure(
 
     with observing("bench", children) as observer:
         observer.listen(SkinStress, "stress", on_stress, batch_profile(bench.rate))
-        if bench.finds_touch and receive_touch is not None:
-            observer.listen(SkinTouch, "touch", receive_touch, batch_profile(bench.rate))
+        if receive_found is not None and bench.topic:
+            kind, profile = FOUND[bench.topic], batch_profile(bench.rate)
+            observer.listen(kind, bench.topic, receive_found, profile)
         observer.spin(MAX_START_S, lambda: n_messages > 0)
         if not n_messages:
             logs = "\n".join(children.log(name)[-800:] for name in names)

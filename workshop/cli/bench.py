@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +52,6 @@ def add_arguments(parser: Parser) -> None:
         cubes=256,
         timed=True,
     )
-    for chain in (skin, touch):
-        _add_chain(chain)
 
     scale = _add(parser, "scale", "skin for growing numbers of cubes, with a picture", timed=True)
     scale.add_argument(
@@ -70,7 +69,17 @@ def add_arguments(parser: Parser) -> None:
         help="picture to write (default: %(default)s)",
     )
 
-    contacts = _add(parser, "contacts", "errors and CPU time of contacts by the shape of the load")
+    contacts = _add(
+        parser,
+        "contacts",
+        "latency of contacts from hubs to a subscriber while four balls move, the processor time "
+        "that they add, and their errors by the shape of the load",
+        cubes=256,
+        timed=True,
+        rate=100.0,
+    )
+    for chain in (skin, touch, contacts):
+        _add_chain(chain)
     contacts.add_argument(
         "--loads",
         type=count,
@@ -87,7 +96,12 @@ def add_arguments(parser: Parser) -> None:
 
 
 def _add(
-    parser: Parser, name: str, text: str, cubes: int | None = None, timed: bool = False
+    parser: Parser,
+    name: str,
+    text: str,
+    cubes: int | None = None,
+    timed: bool = False,
+    rate: float = 1000.0,
 ) -> Parser:
     """Add the subcommand of a benchmark, and return it.
 
@@ -97,6 +111,7 @@ def _add(
         text: What it measures, for the help.
         cubes: Default number of cubes; None: it has no such option.
         timed: Whether it has options for a sampling rate and a duration.
+        rate: Default sampling rate, in Hz.
     """
     benchmark = parser.add_subcommand(name, text)
     if cubes is not None:
@@ -111,7 +126,7 @@ def _add(
         benchmark.add_argument(
             "--rate",
             type=sample_rate,
-            default=1000.0,
+            default=rate,
             metavar="HZ",
             help="scans per second (default: %(default)g)",
         )
@@ -163,21 +178,12 @@ def _measure(options: argparse.Namespace) -> dict[str, Any]:
         from ..bench.pipeline import bench_pipeline
 
         return bench_pipeline(options.cubes)
-    if options.what == "contacts":
-        from cube_tensor_driver.views.figures.style import save
-
-        from ..bench.contacts import bench_moving_balls, bench_shapes, summarise
-        from ..bench.contacts_figure import draw_shapes
-
-        results = bench_shapes(options.loads)
-        save(draw_shapes(results), options.figure)
-        return summarise(results) | bench_moving_balls()
     if options.what == "links":
         from ..bench.links import bench_links
 
         return bench_links(options.cubes, options.rate, options.duration)
 
-    from ..bench.skin import Bench, bench_echo, bench_scale, bench_skin, bench_touch
+    from ..bench.skin import Bench, bench_echo, bench_found, bench_scale, bench_skin
 
     bench = Bench(options.rate, options.duration)
     if options.what == "echo":
@@ -192,5 +198,15 @@ def _measure(options: argparse.Namespace) -> dict[str, Any]:
         options.pads,
     )
     if options.what == "touch":
-        return bench_touch(options.cubes, chain)
+        return bench_found(options.cubes, replace(chain, topic="touch"))
+    if options.what == "contacts":
+        from cube_tensor_driver.views.figures.style import save
+
+        from ..bench.contacts import bench_shapes, summarise
+        from ..bench.contacts_figure import draw_shapes
+
+        moving = bench_found(options.cubes, replace(chain, topic="contacts", has_load=True))
+        results = bench_shapes(options.loads)
+        save(draw_shapes(results), options.figure)
+        return {"balls that move": moving} | summarise(results)
     return bench_skin(options.cubes, chain)
