@@ -29,10 +29,10 @@ def run(options: argparse.Namespace) -> int:
 
     from ..figures.trust import draw_trust
     from ..reports import show_study
-    from ..studies.layout_study import layout_study
+    from ..studies.layout_study import study_layouts
 
     with progress_bar() as report:
-        result = layout_study(progress=report)
+        result = study_layouts(progress=report)
     show_study(result)
     save(draw_trust(result), options.figure)
     if options.json is not None:

@@ -12,10 +12,10 @@ from cube_tensor_driver.config.output_files import write_json
 from cube_tensor_driver.views.figures.style import save
 
 from ..fem.fem import Progress
-from ..paper.experiments import experiments, figure_4
-from ..paper.normal_fall import normal_fall
-from ..paper.rod_parts import rod_parts
-from ..paper.rod_shear import rod_shear
+from ..paper.experiments import compute_figure_4, run_experiments
+from ..paper.normal_fall import split_normal_fall
+from ..paper.rod_parts import split_rod_signals
+from ..paper.rod_shear import recover_rod_shear
 from .deformation import draw_figure_4
 from .experiments import draw_experiment, draw_rod_parts, draw_rod_shear
 
@@ -37,26 +37,26 @@ def save_paper(folder: Path, report: Progress) -> list[Path]:
 
     # Each picture is written as soon as it is there: the whole takes many minutes.
     report(0, 1, PARTS[0])
-    save_picture(draw_figure_4(figure_4()), "figure_4")
+    save_picture(draw_figure_4(compute_figure_4()), "figure_4")
     numbers: dict[str, object] = {}
     for law in ("linear", "finite"):
         report_law = _report_part(report, law)
-        results = experiments(finite=law == "finite", progress=report_law)
+        results = run_experiments(finite=law == "finite", progress=report_law)
         for number, result in enumerate(results, 1):
             save_picture(draw_experiment(result, law), f"experiment_{number}_{law}")
             numbers[f"{result.name}, {law}"] = vars(result)
     # The last results are those of finite strain, in which P_normal falls.
     sheared = [result for result in results if result.name.startswith("b")]
-    numbers["fall of P_normal"] = {one.name: vars(normal_fall(one)) for one in sheared}
+    numbers["fall of P_normal"] = {one.name: vars(split_normal_fall(one)) for one in sheared}
 
-    parts = rod_parts(progress=_report_part(report, "rod"))
+    parts = split_rod_signals(progress=_report_part(report, "rod"))
     save_picture(draw_rod_parts(parts), "rod_parts")
     numbers["rod parts"] = {name: vars(one) for name, one in parts.items()}
     report_held = _report_part(report, "rod, held force")
-    parts = rod_parts(places=NEAR_PLACES, held="force", progress=report_held)
+    parts = split_rod_signals(places=NEAR_PLACES, held="force", progress=report_held)
     numbers["rod parts, held force"] = {name: vars(one) for name, one in parts.items()}
 
-    recovered = rod_shear(progress=_report_part(report, "shear"))
+    recovered = recover_rod_shear(progress=_report_part(report, "shear"))
     save_picture(draw_rod_shear(recovered), "rod_shear")
     numbers["rod shear"] = vars(recovered)
     written.append(folder / "paper.json")

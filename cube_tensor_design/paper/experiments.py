@@ -71,7 +71,7 @@ class Experiment:
     rotation: Array
 
 
-def experiments(
+def run_experiments(
     finite: bool = False,
     progress: Progress | None = None,
 ) -> list[Experiment]:
@@ -111,7 +111,7 @@ def experiments(
             name=name,
             displacement=displacement,
             pads=with_cube.pads,
-            prototype=prototype(frequency[:, ON_LOWER]),
+            prototype=compute_prototype_signals(frequency[:, ON_LOWER]),
             recovered=with_cube.pads @ to_modes,
             truth=without.state,
             rotation=with_cube.rotation,
@@ -149,7 +149,7 @@ def compute_foam_frequency(pads: Array) -> Array:
     return pad_frequency(pads, rest, beta, modulus)
 
 
-def prototype(frequency: Array) -> Array:
+def compute_prototype_signals(frequency: Array) -> Array:
     """Return the signals P_normal, P_shear, P_grad (n, 3) of the paper's prototype, in Hz, from the
     frequencies (n, 4) of its pads C1 .. C4 (the paper's eqs. 8 to 10)."""
     change = frequency - REST_FREQUENCY
@@ -209,7 +209,7 @@ def make_dent_step(
     return make_plate_step(body, 0.0, bonded=bonded, rod=rod)
 
 
-def figure_4() -> dict[str, Deformation]:
+def compute_figure_4() -> dict[str, Deformation]:
     """Return the deformations of the paper's section 3: under shear only (key "zx"), and under a
     normal stress that grows along x (key "zz_x")."""
     return _compute_deformations(VirtualBench(Body(), size=0.2), ("zx", "zz_x"))

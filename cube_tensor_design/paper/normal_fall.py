@@ -22,7 +22,7 @@ import numpy as np
 
 from cube_tensor_driver.core.arrays import Array
 
-from .experiments import Experiment, compute_foam_frequency, prototype
+from .experiments import Experiment, compute_foam_frequency, compute_prototype_signals
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class NormalFall:
     signal: Array
 
 
-def normal_fall(experiment: Experiment) -> NormalFall:
+def split_normal_fall(experiment: Experiment) -> NormalFall:
     """Return the parts of the change from the end of the pressing to the end of the shear.
 
     Args:
@@ -69,7 +69,7 @@ def normal_fall(experiment: Experiment) -> NormalFall:
     mean_stress = np.cumsum([before, *stress])
     equal_pads = np.tile(mean_stress[:, None], 4)
     frequencies = compute_foam_frequency(equal_pads)
-    signal = prototype(frequencies)[:, 0]
+    signal = compute_prototype_signals(frequencies)[:, 0]
     # The last part leads from four equal pads to the pads as they are.
     end = experiment.prototype[-1, 0]
     return NormalFall(stress, np.diff(signal, append=end))

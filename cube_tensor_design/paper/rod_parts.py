@@ -87,7 +87,7 @@ class RodParts:
     parts: Array
 
 
-def rod_parts(
+def split_rod_signals(
     body: Body | None = None,
     places: Sequence[float] = (1e-3, 2e-3, 3e-3, 4e-3, 6e-3, 8e-3),
     progress: Progress | None = None,

@@ -65,7 +65,7 @@ class RodShear:
     pads: Array
 
 
-def rod_shear(
+def recover_rod_shear(
     body: Body | None = None,
     places: Sequence[float] = tuple(np.arange(9) * 1e-3),
     progress: Progress | None = None,

@@ -199,7 +199,7 @@ def compute_field_example() -> FieldExample:
     return FieldExample(surface.points, pressure, skin.position, centre)
 
 
-def field_study(
+def study_fields(
     pitches: Array = PITCHES,
     widths: Array = WIDTHS,
     cases: int = CASES,

@@ -126,7 +126,7 @@ class _Passage:
         return np.concatenate([stress[0], slopes.ravel()])
 
 
-def layout_study(
+def study_layouts(
     sides: Sequence[float] = (4e-3, 2e-3, 1e-3),
     widths: Sequence[float] = (1e-3, 2e-3, 5e-3, 10e-3, 15e-3, 20e-3),
     offsets: Sequence[float] = tuple(np.linspace(-12e-3, 12e-3, 9)),

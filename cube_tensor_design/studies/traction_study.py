@@ -496,7 +496,7 @@ def make_flat_punch(
     return sources, forces / (3 * s_square[:, None])
 
 
-def traction_study(
+def study_tractions(
     settings: Sequence[Setting],
     widths: Sequence[float],
     cases: int = CASES,

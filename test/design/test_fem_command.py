@@ -503,7 +503,7 @@ def test_study_says_where_to_trust(monkeypatch, tmp_path, capsys):
         error,
     )
     monkeypatch.setattr(
-        "cube_tensor_design.studies.layout_study.layout_study", lambda progress: found
+        "cube_tensor_design.studies.layout_study.study_layouts", lambda progress: found
     )
     assert (
         cli.main(["study", "--json", str(tmp_path / "s.json"), "--figure", str(tmp_path / "s.png")])
@@ -543,18 +543,18 @@ def test_paper_makes_its_pictures(monkeypatch, tmp_path):
         yield lambda done, total, what: told.append(done / total)
 
     monkeypatch.setattr("cube_tensor_driver.views.terminal.output.progress_bar", bar)
-    monkeypatch.setattr("cube_tensor_design.figures.paper.experiments", one)
+    monkeypatch.setattr("cube_tensor_design.figures.paper.run_experiments", one)
     monkeypatch.setattr("cube_tensor_design.paper.virtual_bench.CUBE_REFINEMENTS", 0)
     monkeypatch.setattr(rod_parts, "split_signals", lambda *_: np.ones((2, 5)))
     monkeypatch.setattr(
-        "cube_tensor_design.figures.paper.rod_parts",
+        "cube_tensor_design.figures.paper.split_rod_signals",
         lambda progress, places=(2e-3,), held="": (
-            {} if held else rod_parts.rod_parts(NARROW, places=places, progress=progress)
+            {} if held else rod_parts.split_rod_signals(NARROW, places=places, progress=progress)
         ),
     )
     monkeypatch.setattr(
-        "cube_tensor_design.figures.paper.rod_shear",
-        lambda progress: rod_shear.rod_shear(NARROW, places=(2e-3,), progress=progress),
+        "cube_tensor_design.figures.paper.recover_rod_shear",
+        lambda progress: rod_shear.recover_rod_shear(NARROW, places=(2e-3,), progress=progress),
     )
     assert cli.main(["paper", "--out", str(tmp_path / "p")]) == 0
     made = sorted(path.name for path in (tmp_path / "p").iterdir())

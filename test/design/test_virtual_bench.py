@@ -13,11 +13,11 @@ from cube_tensor_design.paper import experiments as paper
 from cube_tensor_design.paper import virtual_bench as benches
 from cube_tensor_design.paper.experiments import make_dent_step, make_plate_step
 from cube_tensor_design.paper.material import Material
-from cube_tensor_design.paper.normal_fall import normal_fall
+from cube_tensor_design.paper.normal_fall import split_normal_fall
 from cube_tensor_design.paper.rod import Rod
 from cube_tensor_design.paper.rod_parts import P_SHEAR, PARTS, draw_back, split_signals
 from cube_tensor_design.paper.virtual_bench import LoadStep, VirtualBench
-from cube_tensor_design.studies.layout_study import layout_study
+from cube_tensor_design.studies.layout_study import study_layouts
 from cube_tensor_driver.core.defaults import REST_FREQUENCY
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS
@@ -217,12 +217,14 @@ def test_the_prototypes_readings_are_sums_of_the_response():
     expected = np.zeros((7, 3))
     for mode, (reading, value) in shown.items():
         expected[PLANE.names.index(mode), reading] = value
-    np.testing.assert_allclose(paper.prototype(REST_FREQUENCY + a.T), expected, atol=1e-9)
+    np.testing.assert_allclose(
+        paper.compute_prototype_signals(REST_FREQUENCY + a.T), expected, atol=1e-9
+    )
 
 
 def experiment(pads, truth, rotation):
     frequency = paper.compute_foam_frequency(pads[:, :4])
-    signals = paper.prototype(frequency)
+    signals = paper.compute_prototype_signals(frequency)
     steps = np.arange(float(len(pads)))
     return paper.Experiment("b", steps, pads, signals, truth, truth, rotation)
 
@@ -232,7 +234,7 @@ def test_the_parts_of_a_falling_p_normal_sum_to_its_fall():
     made_up = experiment(-1e5 * random.random((4, 8)), *random.random((2, 4, 7)))
     made_up.pads[1] = -6e4
     made_up = experiment(made_up.pads, 1e5 * made_up.truth, made_up.rotation[:, 0])
-    parts, mean = normal_fall(made_up), made_up.pads[:, :4].mean(axis=1)
+    parts, mean = split_normal_fall(made_up), made_up.pads[:, :4].mean(axis=1)
     assert parts.stress.sum() == pytest.approx(mean[3] - mean[1])
     assert parts.signal.sum() == pytest.approx(made_up.prototype[3, 0] - made_up.prototype[1, 0])
 
@@ -252,7 +254,7 @@ def test_a_body_that_is_turned_as_a_whole_has_parts_that_sum_to_nothing(coarse):
         VirtualBench(NARROW, cube=cube, finite=True, size=2.0).run(steps) for cube in (True, False)
     )
     rotation = with_cube.rotation - with_cube.rotation[0]
-    parts = normal_fall(experiment(with_cube.pads, without.state, rotation))
+    parts = split_normal_fall(experiment(with_cube.pads, without.state, rotation))
     assert rotation[1] == pytest.approx(angle, rel=1e-6)
     size = np.abs(parts.stress).max()
     assert size > 1e3 and np.abs(parts.stress[:3]).min() > 0.1 * size
@@ -264,7 +266,10 @@ def test_a_rod_above_c2_raises_p_shear_only_with_c2_on_the_lower_face(coarse):
     """C2's side is x > 0 on either face; P_grad rises with both, as in the paper's Fig. 8 (c)."""
     pads = VirtualBench(NARROW, size=2.0).run([make_dent_step(NARROW, Rod(1e-3, 1e-3))]).pads
     frequency = paper.compute_foam_frequency(pads)
-    lower, upper = (paper.prototype(frequency[:, face])[0] for face in (paper.ON_LOWER, slice(4)))
+    lower, upper = (
+        paper.compute_prototype_signals(frequency[:, face])[0]
+        for face in (paper.ON_LOWER, slice(4))
+    )
     assert lower.min() > 0
     assert upper == pytest.approx(lower * [1, -1, 1])
 
@@ -327,7 +332,7 @@ def test_study_error_falls_with_the_square_of_the_side(monkeypatch):
     """The pads see the second derivative of the stress: the error of a stress goes as (d0 /
     depth)^2."""
     monkeypatch.setattr(bodies, "BRICK_SIZES", (bodies.BrickSizes(1.0, 0.3, 6.0),) * 3)
-    result = layout_study(sides=(1e-3, 0.5e-3), widths=(5e-3,), offsets=(-2e-3, 8e-3))
+    result = study_layouts(sides=(1e-3, 0.5e-3), widths=(5e-3,), offsets=(-2e-3, 8e-3))
     zz, slope = COMPONENTS.index("zz"), COMPONENTS.index("zz_x")
     for error in result.error.values():
         assert error[0, 0, zz] < 0.06 and error[0, 0, slope] < 0.06
@@ -340,4 +345,4 @@ def test_study_error_falls_with_the_square_of_the_side(monkeypatch):
 
 def test_study_refuses_a_cube_at_the_surface():
     with pytest.raises(ElasticError, match="leaves the skin"):
-        layout_study(sides=(6e-3,))
+        study_layouts(sides=(6e-3,))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from point_loads import below_ball
 
-from cube_tensor_design.studies.field_study import field_study
+from cube_tensor_design.studies.field_study import study_fields
 from cube_tensor_design.studies.pads_example import sweep
 from cube_tensor_driver.core.defaults import (
     CONTACT_PRESSURE,
@@ -38,7 +38,7 @@ def measured(places: CubePoses, width: float, force: tuple, centre: np.ndarray) 
 
 def test_a_study_ranks_the_kinds_of_cubes_and_counts_those_that_are_saved():
     """One gradient is better than none and worse than two."""
-    study = field_study(np.array([0.006, 0.012]), np.array([0.02]), cases=3)
+    study = study_fields(np.array([0.006, 0.012]), np.array([0.02]), cases=3)
     alone, whole, planar = np.moveaxis(study.error[0], 1, 0)
     assert (whole < planar).all() and (planar < alone).all()
     assert (whole < 0.2).all() and (alone > 2 * whole).all()

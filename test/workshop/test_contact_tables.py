@@ -42,7 +42,7 @@ def studies(monkeypatch):
         results = [made_up(width) for width in widths]
         return {(setting, form): results for setting in THIN for form in FORMS}
 
-    monkeypatch.setattr(contact_tables, "traction_study", traction)
+    monkeypatch.setattr(contact_tables, "study_tractions", traction)
     monkeypatch.setattr(contact_tables, "study_pads", pads)
 
 

@@ -16,7 +16,7 @@ from cube_tensor_design.studies.traction_study import (
     PITCHES,
     WRONG,
     Errors,
-    traction_study,
+    study_tractions,
 )
 from cube_tensor_driver.config.output_files import write_json
 from cube_tensor_driver.mechanics.influence import Influence
@@ -77,12 +77,12 @@ def write_contact_tables(
 
 def compute_contact_tables(true_pads: Influence) -> dict[str, object]:
     """Run the studies and return their tables by name: 3 N press and 0.9 N rub."""
-    balls = traction_study((*MAIN, *PITCHES), WIDTHS, BALL_LOADS, SEED)
+    balls = study_tractions((*MAIN, *PITCHES), WIDTHS, BALL_LOADS, SEED)
     by_pitch = {
         f"{setting.cubes}, pitch {1e3 * setting.pitch:g} mm": errors
         for setting, errors in balls.items()
     }
-    wrong = traction_study(list(WRONG.values()), WRONG_WIDTHS, FEW_LOADS, SEED)
+    wrong = study_tractions(list(WRONG.values()), WRONG_WIDTHS, FEW_LOADS, SEED)
     by_assumption = {name: wrong[setting] for name, setting in WRONG.items()}
     forms = study_pads(true_pads, WIDTHS, PAD_LOADS, SEED)
     by_form = {f"{setting.cubes} as {form}": errors for (setting, form), errors in forms.items()}

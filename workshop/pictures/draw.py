@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from cube_tensor_design.figures.experiments import draw_prototype
 from cube_tensor_design.figures.field import draw_field_study, draw_methods, draw_traction
 from cube_tensor_design.figures.pads_example import draw_pads, draw_sweep
-from cube_tensor_design.paper.experiments import experiments
-from cube_tensor_design.studies.field_study import compute_field_example, field_study
+from cube_tensor_design.paper.experiments import run_experiments
+from cube_tensor_design.studies.field_study import compute_field_example, study_fields
 from cube_tensor_design.studies.pads_example import read_planar_calibration, sweep
 from cube_tensor_design.studies.pads_study import compute_coarse_influence, compute_layer_example
 from cube_tensor_design.studies.traction_study import compute_traction_example
@@ -103,10 +103,10 @@ def make_pictures(folder: Path) -> None:
     write_json(folder / "scale.json", scale)
     save(draw_pads(read_planar_calibration()), folder / "pads.png")
     save(draw_sweep(sweep()), folder / "mistaken_shear.png")
-    a, _, b, _, c, _ = experiments()
+    a, _, b, _, c, _ = run_experiments()
     save(draw_prototype([a, b, c]), folder / "prototype.png")
     save(draw_methods(compute_field_example()), folder / "field.png")
-    study = field_study()
+    study = study_fields()
     save(draw_field_study(study), folder / "field_error.png")
     saved = {
         f"cubes saved at an error of {level}": study.compute_cubes_saved(level)
