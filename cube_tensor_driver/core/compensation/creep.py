@@ -39,6 +39,7 @@ from ..kernel.contract import Offsets
 from ..pipeline import Pipeline
 from ..status import CREEP
 from .low_pass import MAX_STEP_NS, STEP_NS, LowPass
+from .models import tabulate
 
 MAX_UNKNOWN = 100.0
 """Standard deviation of the stress on a pad, in Pa, above which the compensation of creep counts as
@@ -78,26 +79,14 @@ class Creep:
         self._newest = offsets
         models = [calibration.creep for calibration in pipeline.calibrations]
         self.has_model = np.array([model is not None for model in models])
-        shape = offsets.reading.shape
-        present = {cube: model for cube, model in enumerate(models) if model is not None}
-        self._times = np.unique(np.hstack([[], *(model.time for model in present.values())]))
-        n_times = len(self._times)
-        self._amplitude = np.zeros((n_times, *shape))
-        # Errors of the amplitudes by independent causes (causes, K, C, P).
-        stated = [model.deviation for model in present.values() if model.deviation is not None]
-        n_causes = max(map(len, stated), default=0)
-        self._amplitude_errors = np.zeros((n_causes, *self._amplitude.shape))
-        for cube, model in present.items():
-            filters = np.searchsorted(self._times, model.time)
-            pads = slice(model.n_pads)
-            self._amplitude[filters, cube, pads] = model.amplitude.T
-            for cause, deviation in enumerate(
-                model.deviation if model.deviation is not None else ()
-            ):
-                self._amplitude_errors[cause, filters, cube, pads] = deviation.T
-        n_cubes = len(models)
-        time = np.repeat(self._times[:, None], n_cubes, axis=1)
-        self._memories = LowPass(time, self._amplitude)
+        shape = n_cubes, n_pads = offsets.reading.shape
+        time = tabulate(models, "time", (0,)).T
+        amplitude = tabulate(models, "amplitude", (n_pads, 0))
+        self._amplitude = np.ascontiguousarray(np.moveaxis(amplitude, 2, 0))
+        # Errors of the amplitudes by independent causes (C, causes, P, K).
+        self._amplitude_errors = tabulate(models, "deviation", (0, n_pads, len(time)))
+        # A cube with fewer relaxation times than another one has the amplitude 0 for the rest.
+        self._memories = LowPass(np.where(time > 0, time, 1.0), self._amplitude)
         self.offset, self.slope, self.gain = self._memories.sums
         self._total = self._amplitude.sum(axis=0)
         self._stiffness = pipeline.stiffness
@@ -178,8 +167,8 @@ class Creep:
         largest = self._total[cubes] * larger * stiffness * UNIFORM_DEVIATION
         unknown = np.where(is_gap[cubes, None], largest, self._find_unknown(cubes))
         memory = reading - self._memories.lag[:, cubes]
-        by_law = (self._amplitude_errors[:, :, cubes] * memory).sum(axis=1) * stiffness
-        return np.stack([unknown, *by_law], axis=2)
+        by_law = np.einsum("nspk,knp->nps", self._amplitude_errors[cubes], memory)
+        return np.dstack([unknown, by_law * stiffness[..., None]])
 
     def _update_certainty(self) -> None:
         """Mark the creep of a cube as certain again if the error by unknown loads is small enough.

@@ -100,9 +100,9 @@ class LowPass:
             time: Time constants (K, C), in s.
             weight: Weights in the sums (K, C, P).
         """
-        self._constants = time, weight
-        self.lag = np.zeros_like(weight)
-        self._share = np.zeros_like(time)
+        self._constants = np.ascontiguousarray(time), np.ascontiguousarray(weight)
+        self.lag = np.zeros(weight.shape)
+        self._share = np.zeros(time.shape)
         self.sums = np.zeros((3, *weight.shape[1:]))
         self.output, self.slope, self.gain = self.sums
 

@@ -98,26 +98,24 @@ _Model = TypeVar("_Model", bound=EffectModel)
 def tabulate(
     models: Sequence[EffectModel | None],
     name: str,
-    n_pads: int,
-    width: int = 0,
+    shape: tuple[int, ...],
 ) -> Array:
-    """Return an attribute (pads, k) of the models of C cubes as a table (C, n_pads, largest k).
+    """Return an attribute of the models of C cubes as a table (C, ...).
 
-    It is 0 where a cube has no such model, pad or column.
+    It is 0 where a cube has no model, or its attribute has fewer entries than that of others.
 
     Args:
         models: Models of the cubes.
         name: Name of the attribute.
-        n_pads: Largest number of pads of a cube.
-        width: Smallest number of columns of the table.
+        shape: Smallest shape of the attribute in the table.
     """
     values = {cube: getattr(model, name, None) for cube, model in enumerate(models)}
     stated = {cube: value for cube, value in values.items() if value is not None}
-    width = max([width, *(value.shape[1] for value in stated.values())])
-    table = np.zeros((len(models), n_pads, width))
+    largest = np.max([shape, *(value.shape for value in stated.values())], axis=0)
+    table = np.zeros((len(models), *largest.astype(int)))
     for cube, value in stated.items():
-        pads, columns = value.shape
-        table[cube, :pads, :columns] = value
+        part: tuple[int | slice, ...] = (cube, *map(slice, value.shape))
+        table[part] = value
     return table
 
 

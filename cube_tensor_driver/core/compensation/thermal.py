@@ -64,29 +64,27 @@ class Thermal:
         """
         models = [calibration.thermal for calibration in pipeline.calibrations]
         self.has_model = np.array([model is not None for model in models])
-        lags = {cube: model.lag for cube, model in enumerate(models) if model is not None}
-        n_lags = max(map(len, lags.values()), default=0)
-        n_cubes = len(models)
-        times = np.full((n_lags, n_cubes), MIN_LAG_S)
-        weight = np.zeros((n_lags, n_cubes, 1))
-        for cube, lag in lags.items():
-            times[: len(lag), cube] = np.maximum(lag, MIN_LAG_S)
-            weight[: len(lag), cube, 0] = filter_weights(times[: len(lag), cube])
-        self._reference = np.array([0 if model is None else model.reference for model in models])
+        n_cubes, n_pads = pipeline.stiffness.shape
+        lag = np.maximum(tabulate(models, "lag", (0,)), MIN_LAG_S)
+        weight = np.zeros_like(lag)
+        for cube, model in enumerate(models):
+            n_lags = 0 if model is None else len(model.lag)
+            weight[cube, :n_lags] = filter_weights(lag[cube, :n_lags])
+        self._filters = LowPass(lag.T, weight.T[..., None])
+        self._reference = tabulate(models, "reference", ())
         # Stresses of the pads, and their errors by independent causes (C, P, k), in Pa per K or
         # power of K.
         self._coefficient, self._deviation, self._ramp = (
-            tabulate(models, name, pipeline.n_pads) for name in ("coefficient", "deviation", "ramp")
+            tabulate(models, name, (n_pads, 0)) for name in ("coefficient", "deviation", "ramp")
         )
-        n_pads = np.array([calibration.layout.n_pads for calibration in pipeline.calibrations])
+        own_pads = np.array([calibration.layout.n_pads for calibration in pipeline.calibrations])
         # Sizes of the linear effect and of `_ramp`, as root mean squares over the pads of a cube.
         linear = self._coefficient[..., :1]
         self._linear_size, self._ramp_size = (
-            np.sqrt((values**2).sum(axis=(1, 2)) / n_pads) for values in (linear, self._ramp)
+            np.sqrt((values**2).sum(axis=(1, 2)) / own_pads) for values in (linear, self._ramp)
         )
         # For a pad that the cube does not have, quotients are 0.
         self._stiffness = np.where(pipeline.stiffness > 0, pipeline.stiffness, np.inf)
-        self._filters = LowPass(times, weight)
 
         # Time stamp of each cube's row in the last step, in ns, and the last measured temperature,
         # in °C.

@@ -32,8 +32,8 @@ class Weight:
         self.has_model = np.array([model is not None for model in models])
         n_pads = pipeline.n_pads
         gain = tabulate_pads(pipeline.calibrations, "gain", n_pads, fill=0)[..., None]
-        self.response = gain * tabulate(models, "response", n_pads, width=3)
-        self._deviation = gain * tabulate(models, "deviation", n_pads, width=3)
+        self.response = gain * tabulate(models, "response", (n_pads, 3))
+        self._deviation = gain * tabulate(models, "deviation", (n_pads, 3))
 
     def errors(self, cubes: Index, force: Array) -> Array:
         """Return the errors (n, P, 3) of the compensation of weight by independent causes, in Pa.
