@@ -9,8 +9,6 @@ windows began. Therefore it is read from the recorded stress when that stress is
 
 from __future__ import annotations
 
-import itertools
-from collections import deque
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -68,14 +66,15 @@ class RecordedHealthReader:
             bag: Open bag.
             topic: Topic of the frequencies.
         """
-        skin = topic.removesuffix("frequencies")
         self._bag = bag
-        self._topic = f"{skin}stress"
-        self._has_stress = self._topic in bag.topics(STRESS)
-        self._last_wanted_ns = 0
-        self._newest_ns = 0
-        self._batches: deque[_StressBatch] = deque()
+        self._topic = f"{topic.removesuffix('frequencies')}stress"
+        self._restart()
+
+    def _restart(self) -> None:
         self._unread = self._read()
+        self._batches: list[_StressBatch] = []
+        self._newest_ns = 0
+        self._last_wanted_ns = 0
 
     def at(self, rows: FrequencyRows) -> RecordedHealth:
         """Return the recorded health (which pads were left out, and why) for rows of frequencies.
@@ -89,27 +88,30 @@ class RecordedHealthReader:
             left_out=np.zeros(count, np.uint32),
             status=np.zeros(count, np.uint16),
         )
-        if not self._has_stress or not count:
+        if not count:
             return health
         begin_ns = int(rows.stamp_ns.min())
         end_ns = int(rows.stamp_ns.max())
-        for batch in self._read_batches_between(begin_ns, end_ns):
+        for batch in self._read_between(begin_ns, end_ns):
             # Usually a batch of stress has exactly the rows of the batch of frequencies, so that no
             # search is needed.
             has_same_stamps = np.array_equal(batch.stamp_ns, rows.stamp_ns)
             if has_same_stamps and np.array_equal(batch.cube, rows.cube):
                 known = np.ones(count, bool)
                 return RecordedHealth(known, batch.left_out, batch.status)
-            _copy_matching(batch, rows, health)
+            match = match_rows(batch, rows)
+            # A hub counts from 0 again after a restart, so an equal sequence number with another
+            # stamp is a different sample.
+            is_same = (match != NO_MATCH) & (batch.stamp_ns[match] == rows.stamp_ns)
+            source = match[is_same]
+            health.known[is_same] = True
+            health.left_out[is_same] = batch.left_out[source]
+            health.status[is_same] = batch.status[source]
             if health.known.all():
                 break
         return health
 
-    def _read_batches_between(
-        self,
-        begin_ns: int,
-        end_ns: int,
-    ) -> Iterator[_StressBatch]:
+    def _read_between(self, begin_ns: int, end_ns: int) -> Iterator[_StressBatch]:
         """Yield the batches of recorded stress that can contain rows with stamps in a span of time.
 
         Batches already in memory come first. The bag is read further only while the caller takes
@@ -120,38 +122,33 @@ class RecordedHealthReader:
             end_ns: End of the span, in ns since the Unix epoch.
         """
         if end_ns < self._last_wanted_ns - MAX_DISORDER_NS:
-            self._newest_ns = 0
-            self._batches.clear()
-            self._unread = self._read()
+            self._restart()
         self._last_wanted_ns = end_ns
         oldest_ns = begin_ns - MAX_DISORDER_NS
-        while self._batches and self._batches[0].last_ns < oldest_ns:
-            self._batches.popleft()
-
-        kept = tuple(self._batches)
-        for batch in itertools.chain(kept, self._read_until(end_ns + MAX_DISORDER_NS)):
+        self._batches = [batch for batch in self._batches if batch.last_ns >= oldest_ns]
+        # A list can grow while it is iterated, here by the batches that are read further.
+        for batch in self._batches or self._read_next(end_ns):
             if batch.first_ns <= end_ns and batch.last_ns >= begin_ns:
                 yield batch
+            if batch is self._batches[-1]:
+                self._read_next(end_ns)
 
-    def _read_until(self, limit_ns: int) -> Iterator[_StressBatch]:
-        """Read, keep and yield further batches of stress until a stamp of `limit_ns` is reached.
-
-        Args:
-            limit_ns: Stamp, in ns since the Unix epoch, at which reading stops.
-        """
-        while self._newest_ns < limit_ns:
-            batch = next(self._unread, None)
-            if batch is None:
-                return
-            self._newest_ns = max(self._newest_ns, batch.last_ns)
-            self._batches.append(batch)
-            yield batch
+    def _read_next(self, end_ns: int) -> list[_StressBatch]:
+        """Read one more batch, if rows up to a stamp may be in it, and return all batches."""
+        if self._newest_ns < end_ns + MAX_DISORDER_NS:
+            for batch in self._unread:
+                self._newest_ns = max(self._newest_ns, batch.last_ns)
+                self._batches.append(batch)
+                break
+        return self._batches
 
     def _read(self) -> Iterator[_StressBatch]:
         """Yield the recorded columns of stress that state the health of the pads, batch by batch.
 
         The bag is read from its beginning.
         """
+        if self._topic not in self._bag.topics(STRESS):
+            return
         names = ("cube", "sequence", "left_out", "status")
         for columns in self._bag.columns(self._topic, stress_codec, names):
             stamp_ns, cube, sequence, left_out, status = columns
@@ -165,26 +162,3 @@ class RecordedHealthReader:
                     first_ns=int(stamp_ns.min()),
                     last_ns=int(stamp_ns.max()),
                 )
-
-
-def _copy_matching(
-    batch: _StressBatch,
-    rows: FrequencyRows,
-    health: RecordedHealth,
-) -> None:
-    """Copy the health of those rows that a batch of recorded stress contains.
-
-    Args:
-        batch: Recorded stress.
-        rows: Rows of frequencies whose health is wanted.
-        health: Health of these rows, which is changed in place.
-    """
-    match = match_rows(batch, rows)
-    # A hub counts from 0 again after a restart, so an equal sequence number with another stamp is a
-    # different sample.
-    has_match = match != NO_MATCH
-    is_same = has_match & (batch.stamp_ns[match] == rows.stamp_ns)
-    source = match[is_same]
-    health.known[is_same] = True
-    health.left_out[is_same] = batch.left_out[source]
-    health.status[is_same] = batch.status[source]

@@ -51,6 +51,7 @@ class Recording:
         infos: SkinInfo messages (cubes, calibrations and rest frequencies) in the order of their
             stamps; there is at least one.
         settings: Calibrations and rest frequencies in each of the SkinInfo messages.
+        health: Reader of the health of the pads (which were left out as faulty, and why).
         compensation: Reader of the recorded compensation of weight, creep and temperature.
     """
 
@@ -85,8 +86,7 @@ class Recording:
             raise BagError(f"{bag.path}: {reason}") from None
         since_ns = [stamp_ns(info) for info in self.infos]
         self._since_ns = np.array(since_ns)
-        # The recorded stress, which states the health, is read only when `health_at` is called.
-        self._health = RecordedHealthReader(bag, topic)
+        self.health = RecordedHealthReader(bag, topic)
         poses = read_cube_poses(self.infos[-1])
         self.compensation = CompensationReader(bag, topic, poses)
 
@@ -125,17 +125,6 @@ class Recording:
         newest_ns = rows.stamp_ns.max(initial=0, keepdims=True)
         number = int(self.info_index_at(newest_ns)[0])
         return self.settings[number]
-
-    def health_at(self, rows: FrequencyRows) -> RecordedHealth:
-        """Return the health of the pads that was found when these rows were recorded.
-
-        The health states which pads were left out as faulty, and why. Calls in the order of
-        recording are fastest, because the bag is then read only once.
-
-        Args:
-            rows: Rows of frequencies (samples of cubes).
-        """
-        return self._health.at(rows)
 
     def check_calibrations_stay(self) -> None:
         """Check that every cube has the same calibration throughout the recording.

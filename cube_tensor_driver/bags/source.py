@@ -135,7 +135,7 @@ class BagSource:
         for messages, recorded_ns in self.bag.frequencies(self.topic):
             # The health is read before messages are divided, because the recorded stress was
             # decoded in the same groups.
-            health = self.recording.health_at(messages.rows) if use_health else None
+            health = self.recording.health.at(messages.rows) if use_health else None
             yield from self._divide(messages, recorded_ns, health)
 
     def _divide(

@@ -91,7 +91,7 @@ def test_the_recorded_stress_comes_again_whoever_iterates(bag):
         for rows in source:
             if settings is not (settings := source.recording.settings_at(rows)):
                 reconstructor.rest_frequency = settings.rest_frequency
-            made.append(reconstructor.process(rows, source.recording.health_at(rows)))
+            made.append(reconstructor.process(rows, source.recording.health.at(rows)))
         assert_same(made, recorded)
     assert (np.concatenate([rows.status for rows in recorded]) & STUCK).any()
 
@@ -122,11 +122,11 @@ def test_health_goes_by_cube_and_stamp(bag):
         rows = next(iter(source))
         later = rows.select(rows.stamp_ns > START_NS + 1_200_000_000)
         some = rows.select(np.random.default_rng(1).permutation(len(rows))[:300])
-        health = source.recording.health_at(some)
+        health = source.recording.health.at(some)
         assert health.known.all()
         shifted = dataclasses.replace(some, stamp_ns=some.stamp_ns + 1)
-        assert not source.recording.health_at(shifted).known.any()
-        health = source.recording.health_at(later)
+        assert not source.recording.health.at(shifted).known.any()
+        health = source.recording.health.at(later)
         assert (health.left_out == np.where(later.cube == 3, 4, 0)).all()
         assert ((health.status & STUCK != 0) == (later.cube == 3)).all()
 

@@ -66,7 +66,7 @@ class RecordedReconstruction:
         if settings is not self._settings:
             self._settings = settings
             reconstructor.rest_frequency = settings.rest_frequency
-        return self._source.recording.health_at(rows)
+        return self._source.recording.health.at(rows)
 
     def compensation_at(
         self,
