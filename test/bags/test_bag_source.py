@@ -14,6 +14,7 @@ pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 
 from bag_maker import START_NS, frequencies_of, info_of, loads, make_bag
 
+from cube_tensor_driver.bags import read
 from cube_tensor_driver.bags.metadata import make_typestore
 from cube_tensor_driver.bags.reprocess.job import reconstruct
 from cube_tensor_driver.bags.reprocess.recorded_reconstruction import RecordedReconstruction
@@ -129,6 +130,15 @@ def test_health_goes_by_cube_and_stamp(bag):
         health = source.recording.health.at(later)
         assert (health.left_out == np.where(later.cube == 3, 4, 0)).all()
         assert ((health.status & STUCK != 0) == (later.cube == 3)).all()
+
+
+def test_health_of_rows_far_back_is_read_again(bag, monkeypatch):
+    """In batches of 10 messages, so that the first one does not stay in memory."""
+    monkeypatch.setattr(read, "MAX_BATCH_ROWS", 160)
+    with open_bag(bag) as source:
+        first, *_, last = source
+        for rows in (first, last, first):
+            assert source.recording.health.at(rows).known.all()
 
 
 def test_messages_whose_scans_would_join_come_one_by_one(tmp_path):
