@@ -145,11 +145,9 @@ class SqliteReader:
 
     def _read_connections(self) -> dict[int, Connection]:
         """Read the topics of the file by their ids in the table ``topics``."""
-        # Older versions of rosbag2 stored neither quality of service profiles nor definitions of
-        # message types.
-        has_qos = "offered_qos_profiles" in self._list_columns("topics")
         definitions: dict[str, str] = {}
-        if self._list_columns("message_definitions"):
+        # rosbag2 of ROS 2 Humble stores no definitions of message types.
+        if execute(self._database, "PRAGMA table_info(message_definitions)").fetchone():
             definitions = dict(
                 execute(
                     self._database,
@@ -165,10 +163,9 @@ class SqliteReader:
                 f"SELECT topic_id, count(*) FROM messages WHERE {_IS_SOUND} GROUP BY topic_id",
             )
         )
-        qos_column = "CAST(offered_qos_profiles AS TEXT)" if has_qos else "''"
         topics = execute(
             self._database,
-            f"SELECT id, name, type, {qos_column} FROM topics"
+            "SELECT id, name, type, CAST(offered_qos_profiles AS TEXT) FROM topics"
             " WHERE typeof(name) = 'text' AND typeof(type) = 'text'",
         )
         return {
@@ -181,10 +178,6 @@ class SqliteReader:
             )
             for number, topic, msgtype, qos in topics
         }
-
-    def _list_columns(self, table: str) -> set[str]:
-        """Return the names of a table's columns; an empty set if the table does not exist."""
-        return {row[1] for row in execute(self._database, f"PRAGMA table_info({table})")}
 
 
 class SqliteWriter:
