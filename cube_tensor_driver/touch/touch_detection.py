@@ -21,6 +21,7 @@ because the reconstruction node does not load scipy.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -110,6 +111,10 @@ longer time, the cube counts as untouched, and its next sample starts the detect
 NO_TOUCH = -1
 """Number in place of the number of a touch where there is no touch."""
 
+ERRORS_PERIOD_NS = 100_000_000
+"""Time, in ns, after which the errors of the compensation at a touch are computed again. Creep and
+the effect of temperature are computed in the same period."""
+
 PRESSURE = COMPONENTS.index("zz")
 """Index in `COMPONENTS` of the stress zz, whose negative is the pressure."""
 
@@ -170,6 +175,7 @@ class Touch:
         self,
         skin: Skin | str | Path,
         false_alarms: float = FALSE_ALARMS,
+        find_errors: Callable[[Index, PadMasks], Array] | None = None,
     ) -> None:
         """Prepare the detection, which takes up to some seconds on a large bent skin.
 
@@ -178,6 +184,8 @@ class Touch:
             false_alarms: Rate of touches found in noise alone, per hour, of the whole skin. It
                 holds for noise as in the calibrations, for drift up to `MAX_DRIFT`, and at 1 kHz
                 or a higher rate in the skin file.
+            find_errors: `Reconstructor.errors` of the reconstructor that computes the stress. The
+                stated deviations then contain errors of the compensation. None: they do not.
 
         Raises:
             ConfigError: The rate is not above 0.
@@ -214,6 +222,10 @@ class Touch:
 
         # The largest value among the neighbours is found faster if they are the first axis.
         self._near = near.T.copy()
+        self._find_errors = find_errors
+        self._errors = np.zeros((0, NEIGHBOURS, len(COMPONENTS), 0))
+        self._errors_cube = np.zeros(0, np.intp)
+        self._errors_ns = 0
         # `_slow` is the slow part of each value (NaN where unknown), `_change` the difference of
         # the value from it.
         self._slow = np.full(variance.shape, np.nan)
@@ -430,9 +442,12 @@ class Touch:
         variance = self._deviation[cube] ** 2
         variance += margin**2
         variance += gain_deviation**2
+        errors = self._update_errors(cube, stamp_ns)
+        own_errors = errors[:, 0, PRESSURE]
+        variance += (own_errors**2).sum(axis=1)
         share = margin / np.maximum(own, 1e-9)
         share = np.clip(share, 0, 1)
-        force, force_deviation = self._estimate_forces(cube, share[:, None])
+        force, force_deviation = self._estimate_forces(cube, share[:, None], errors)
         return Touches(
             stamp_ns=stamp_ns,
             cube=cube,
@@ -471,12 +486,41 @@ class Touch:
         self._id = self._id[top]
         return number
 
-    def _estimate_forces(self, cube: Index, share: Array) -> tuple[Array, Array]:
+    def _update_errors(self, cube: Index, stamp_ns: int) -> Array:
+        """Return the errors (m, W, 15, K) of the values of m cubes and their neighbours.
+
+        They have K causes other than noise. They are computed for other cubes than before, or after
+        `ERRORS_PERIOD_NS`.
+
+        Args:
+            cube: Indices (m,) of the cubes.
+            stamp_ns: Time of the earliest sample of the scan, in ns.
+        """
+        near = self._near[:, cube].T
+        is_old = abs(stamp_ns - self._errors_ns) >= ERRORS_PERIOD_NS
+        if is_old or not np.array_equal(cube, self._errors_cube):
+            self._errors_cube = cube
+            self._errors_ns = stamp_ns
+            shape = *near.shape, len(COMPONENTS)
+            self._errors = np.zeros((*shape, 0))
+            if self._find_errors is not None and len(cube):
+                cubes = near.ravel()
+                errors = self._find_errors(cubes, self._left_out[cubes])
+                self._errors = np.nan_to_num(errors).reshape(*shape, -1)
+        return self._errors
+
+    def _estimate_forces(
+        self,
+        cube: Index,
+        share: Array,
+        errors: Array,
+    ) -> tuple[Array, Array]:
         """Return the forces (m, 3) at m cubes and their standard deviations (m, 3), in N.
 
         Args:
             cube: Indices (m,) of the cubes.
             share: Fraction (m, 1) of the force that drift and earlier loads may have caused.
+            errors: Errors (m, W, 15, K) of the values, as from `_update_errors`.
         """
         estimate = self._estimate
         if estimate is None:
@@ -509,6 +553,9 @@ class Touch:
         other_variance = OTHER_LOADS**2 * others @ total_square
         variance += other_variance
         variance += lasting_force**2
+        by_value = errors.reshape(len(cube), n_values, errors.shape[3])
+        force_errors = by_value.swapaxes(1, 2) @ estimate.weights[kind]
+        variance += (force_errors**2).sum(axis=1)
 
         is_missing = np.isnan(self._slow[near])
         is_complete = is_missing == self._unobserved[near]

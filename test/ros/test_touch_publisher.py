@@ -17,6 +17,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import Elastomer, Skin, read_skin
+from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import StressRows, concatenate
 from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.msg import SkinTouch
@@ -55,7 +56,7 @@ def scan(number: int, values: np.ndarray) -> StressRows:
 def make_publisher(skin: Skin) -> tuple[TouchPublisher, Topic]:
     topic = Topic()
     node = SimpleNamespace(own=lambda one: one, create_lifecycle_publisher=lambda *_: topic)
-    return TouchPublisher(node, skin, QoSProfile(depth=1), 1.0), topic
+    return TouchPublisher(node, skin, QoSProfile(depth=1), 1.0, Reconstructor(skin)), topic
 
 
 def test_each_number_of_a_touch_is_in_its_field():

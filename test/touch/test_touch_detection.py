@@ -248,6 +248,31 @@ def contact_at(number: int, centre) -> TrackedContact:
     return TrackedContact(**values)
 
 
+def test_stated_deviations_contain_errors_that_all_cubes_have_in_common(make_skin):
+    """Two causes; the errors of all cubes by one of them make a force together."""
+    run = Run(make_skin(6, known=True))
+    load = run.ball((0.1, 0.0, -0.5), (1e-3, 2e-3))
+    scans = [run.rows(load if number > 70 else 0.0) for number in range(73)]
+    calls, pattern = [], run.random.normal(size=(15, 2))
+    pattern *= np.where(np.arange(15) < 6, 30.0, 1e4)[:, None]
+
+    def find_errors(cubes, left_out):
+        calls.append(cubes)
+        return np.tile(pattern, (len(cubes), 1, 1))
+
+    informed = Touch(run.skin, find_errors=find_errors)
+    for rows in scans:
+        (plain,), (stated,) = run.touch(rows), informed(rows)
+    np.testing.assert_array_equal(stated.force, plain.force)
+    assert len(plain.cube) == 1 and len(calls) == 1 and calls[0][0] == plain.cube[0]
+    added = stated.pressure_uncertainty**2 - plain.pressure_uncertainty**2
+    np.testing.assert_allclose(added, (pattern[2] ** 2).sum())
+    weights = informed._estimate.weights[informed._estimate.kind[plain.cube]]
+    force = pattern.T @ weights.reshape(-1, 15, 3).sum(axis=0)
+    added = stated.force_uncertainty**2 - plain.force_uncertainty**2
+    np.testing.assert_allclose(added[0], (force**2).sum(axis=0), rtol=1e-6)
+
+
 def test_several_scans_in_one_call_give_the_same(make_skin):
     """With a cube that is missing in a scan, values that are not known, and pads left out."""
     run = Run(make_skin(6, known=True))

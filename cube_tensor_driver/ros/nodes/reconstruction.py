@@ -108,7 +108,13 @@ class Reconstruction(CubeNode):
         false_alarms = float(self.value("touch_false_alarms"))
         self._touch = None
         if false_alarms:
-            self._touch = TouchPublisher(self, skin, profile, false_alarms)
+            self._touch = TouchPublisher(
+                self,
+                skin,
+                profile,
+                false_alarms,
+                self._reconstructor,
+            )
         self._state_interfaces = make_state_interfaces(self, skin)
         self._info = self.own(self.create_publisher(SkinInfo, "info", LATCHED))
         self._taring = Taring(

@@ -12,6 +12,7 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 
 from ...config.skin import Skin
+from ...core.reconstructor import Reconstructor
 from ...core.rows import StressRows
 from ...messages.codec import SECOND
 from ...messages.touch import make_touch_message
@@ -43,6 +44,7 @@ class TouchPublisher:
         skin: Skin,
         profile: QoSProfile,
         false_alarms: float,
+        reconstructor: Reconstructor,
     ) -> None:
         """Make the publisher.
 
@@ -52,8 +54,9 @@ class TouchPublisher:
             profile: Quality of service of `touch`.
             false_alarms: Accepted rate of false alarms of the whole skin, per hour. A false alarm
                 is a touch that is found although there is only noise.
+            reconstructor: Computes the stress, and states its errors.
         """
-        self._set_up = partial(Touch, skin, false_alarms)
+        self._set_up = partial(Touch, skin, false_alarms, reconstructor.errors)
         self._worker = ThreadPoolExecutor(1)
         self._future: Future[Touch] | None = None
         self._make_message = partial(make_touch_message, make_message, skin.parent_frame)
