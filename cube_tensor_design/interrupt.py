@@ -10,7 +10,6 @@ another thread, which then ends the process.
 from __future__ import annotations
 
 import os
-import select
 import signal
 import sys
 import threading
@@ -19,32 +18,22 @@ from contextlib import contextmanager
 
 from cube_tensor_driver.processes.stop_signals import INTERRUPTED
 
-GRACE_S = 0.3
-"""Time, in seconds, from Ctrl-C until the process is ended without running `finally` blocks.
-
-A main thread that executes Python code gets KeyboardInterrupt at once, and has this time to run its
-`finally` blocks. In the middle of a long call of C code it cannot get the exception.
-"""
-
-_SHOW_CURSOR = b"\x1b[?25h"
-"""Escape sequence that makes a terminal show its cursor again."""
+_SHOW_CURSOR = b"\n\x1b[?25h"
+"""End of the line of a progress bar, and the escape sequence that makes a terminal show its cursor
+again."""
 
 
 @contextmanager
 def ends_at_once() -> Iterator[None]:
-    """Let Ctrl-C end the process after at most `GRACE_S`, even in the middle of C code.
+    """Let Ctrl-C end the process, even in the middle of C code.
 
-    Use it only in the main thread, and for work that only computes: if the process ends in C code,
-    no `finally` block runs. The C code must release Python's global interpreter lock.
+    Use it only in the main thread, and for work that only computes, because no `finally` block
+    runs. The C code must release Python's global interpreter lock.
     """
     watched, written = os.pipe()
     os.set_blocking(written, False)
     before = signal.set_wakeup_fd(written, warn_on_full_buffer=False)
-    watcher = threading.Thread(
-        target=_end_on_interrupt,
-        args=(watched,),
-        daemon=True,
-    )
+    watcher = threading.Thread(target=_end_on_interrupt, args=(watched,), daemon=True)
     watcher.start()
     try:
         yield
@@ -56,19 +45,14 @@ def ends_at_once() -> Iterator[None]:
 
 
 def _end_on_interrupt(watched: int) -> None:
-    """Wait for SIGINT and end the process if it does not end by itself within `GRACE_S`.
+    """Wait for SIGINT and end the process.
 
     Args:
         watched: File descriptor of a pipe into which Python writes the number of each signal. The
             function returns when the other end of the pipe is closed.
     """
     while number := os.read(watched, 1):
-        if number[0] != signal.SIGINT:
-            continue
-        # When the main thread leaves the `with` block, it closes the other end of the pipe, and
-        # `select` returns before the time is over.
-        has_ended, _, _ = select.select([watched], [], [], GRACE_S)
-        if not has_ended:
+        if number[0] == signal.SIGINT:
             # A progress bar hides the cursor, and the code that would show it again does not run.
             if sys.stderr.isatty():
                 os.write(sys.stderr.fileno(), _SHOW_CURSOR)

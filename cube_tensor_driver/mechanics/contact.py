@@ -28,7 +28,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arrays import Array
+from ..core.arrays import Array, Complex
 from ..core.errors import ElasticError
 
 _HERTZ_ORDER_PER_RADIUS = 5.5
@@ -43,13 +43,8 @@ suffices for contacts with radii that are small compared with the depth of the c
 _STRESS_AXES = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 """Indices of both axes (0: x, 1: y, 2: z) of the stress components xx, yy, zz, yz, zx, xy."""
 
-_AIRY_COMPONENTS = ((0, 1, 1, 1.0), (1, 0, 0, 1.0), (5, 0, 1, -1.0))
-"""Stress components that are second derivatives of the Airy function g, as index of the component,
-the two axes of the derivative, and its sign: xx = g_yy, yy = g_xx, xy = -g_xy."""
-
-_THIRD_DERIVATIVES = ((0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1))
-"""Axes (0: x, 1: y) of the four different third derivatives of the Airy function g (file
-head) along the surface: xxx, xxy, xyy, yyy."""
+_IN_PLANE = [0, 1, 5]
+"""Indices of the stress components xx, yy and xy, which the Airy function g determines."""
 
 
 def field(
@@ -272,12 +267,19 @@ def _compute_airy(
 
     C is the part of the stress that depends on Poisson's ratio. It consists of derivatives of the
     potentials chi, chi_Z = ln(R + Z) and chi_ZZ = 1/R. In a plane Z = const, each potential is a
-    function h of r = sqrt(d_x^2 + d_y^2), and its second derivatives are::
+    function h of r^2 = x^2 + y^2. With the complex position c = x + i y and its conjugate c*, its
+    derivatives follow from those of h1 = h'/r, h2 = h1'/r and so on::
 
-        h_ij = delta_ij h1 + d_i d_j h2,   h1 = h'/r,   h2 = h1'/r
+        dh/dc = c* h1 / 2,     dh1/dc = c* h2 / 2,     dr^2/dc = c*,     4 d^2/(dc dc*) = Laplace
 
-    Higher derivatives contain h3 = h2'/r and h4 = h3'/r. In the code, the numbered functions are
-    called chi2 to chi4 for h = chi, log1 to log3 for h = chi_Z, and inv1 and inv2 for h = chi_ZZ.
+    The trace T = g_xx + g_yy and the deviator D = g_xx - g_yy - 2 i g_xy of the second derivatives
+    of g then are, with s = F_x x + F_y y and F = F_x + i F_y::
+
+        T = 4 g_cc* = s (4 chi2 + r^2 chi3) - F_z (2 log1 + r^2 log2)
+        D = 4 g_cc  = 2 F* c* chi2 + c*^2 (s chi3 - F_z log2)
+
+    In the code, the numbered functions are called chi2 to chi4 for h = chi, log1 to log3 for
+    h = chi_Z, and inv1 and inv2 for h = chi_ZZ.
 
     Args:
         d: Positions (..., N, L, 3) of N points from L forces, in m.
@@ -290,9 +292,10 @@ def _compute_airy(
     x, y, z = np.moveaxis(d, -1, 0)
     forces_at_points = np.broadcast_to(forces, d.shape)
     fx, fy, fz = np.moveaxis(forces_at_points, -1, 0)
-    position = (x, y)
-    force = (fx, fy)
     f_dot_d = fx * x + fy * y
+    r_square = x**2 + y**2
+    position = x - 1j * y  # The conjugates c* and F* of the docstring.
+    force = fx - 1j * fy
 
     # The derivatives of the potentials are polynomials in u = 1/R and v = 1/(R + Z).
     u = 1.0 / distance
@@ -306,74 +309,47 @@ def _compute_airy(
     inv1 = -(u**3)
     inv2 = 3 * u**5
 
-    h2 = f_dot_d * chi3 - fz * log2
-    h3 = f_dot_d * chi4 - fz * log3
-
-    def differentiate(
-        i: int,
-        j: int,
-        t2: Array,
-        t3: Array,
-        n1: Array,
-        n2: Array,
-    ) -> Array:
-        """Return the second derivative g_ij of the Airy function g, or the derivative of g_ij by Z.
-
-        g contains one potential h for tangential forces and one for normal forces. The arguments
-        are the functions h1 = h'/r, h2 = h1'/r and h3 = h2'/r of these two potentials, where ' is
-        the derivative by the distance r in a plane Z = const.
+    def differentiate_twice(t2: Array, t3: Array, n1: Array, n2: Array) -> tuple[Array, Complex]:
+        """Return trace T and deviator D of the second derivatives of g, or their derivatives by Z.
 
         Args:
-            i: First axis of the derivative, 0 (x) or 1 (y).
-            j: Second axis of the derivative.
             t2: h2 for tangential forces, of h = chi; for the derivative by Z, of h = chi_Z.
             t3: h3 of the same h.
             n1: h1 for normal forces, of h = chi_Z; for the derivative by Z, of h = chi_ZZ.
             n2: h2 of the same h.
         """
-        mixed = force[i] * position[j] + force[j] * position[i]
-        by_distance = f_dot_d * t3 - fz * n2
-        value = t2 * mixed + by_distance * position[i] * position[j]
-        if i == j:
-            value = value + f_dot_d * t2 - fz * n1
-        return np.asarray(value.sum(axis=-1))
+        trace = f_dot_d * (4 * t2 + r_square * t3) - fz * (2 * n1 + r_square * n2)
+        deviator = 2 * force * position * t2 + position**2 * (f_dot_d * t3 - fz * n2)
+        return trace.sum(axis=-1), deviator.sum(axis=-1)
 
-    def third(
-        i: int,
-        j: int,
-        k: int,
-    ) -> Array:
-        """Return the third derivative g_ijk of the Airy function g along axes i, j and k (0, 1).
+    trace, deviator = differentiate_twice(chi2, chi3, log1, log2)
+    trace_z, deviator_z = differentiate_twice(log2, log3, inv1, inv2)
+    # These are dT/dc = dD/dc* and dD/dc.
+    tangential = f_dot_d * (3 * chi3 + r_square / 2 * chi4)
+    normal = fz * (2 * log2 + r_square / 2 * log3)
+    mixed = force / 2 * (4 * chi2 + r_square * chi3) + position * (tangential - normal)
+    mixed = mixed.sum(axis=-1)
+    pure = position**2 * (1.5 * force * chi3 + position / 2 * (f_dot_d * chi4 - fz * log3))
+    pure = pure.sum(axis=-1)
 
-        The loop runs over the three ways to separate one of the indices from the other two.
-        """
-        value = h3 * position[i] * position[j] * position[k]
-        for a, b, c in ((i, j, k), (j, i, k), (k, i, j)):
-            value = value + chi3 * force[a] * position[b] * position[c]
-            if b == c:
-                value = value + chi2 * force[a]
-                value = value + h2 * position[a]
-        return np.asarray(value.sum(axis=-1))
-
-    third_derivatives = {axes: third(*axes) for axes in _THIRD_DERIVATIVES}
-
-    # The field C consists of second derivatives of the Airy function g: C_xx = g_yy, C_yy = g_xx,
-    # C_xy = -g_xy. The depth Z below a force is -z, so a derivative by z is the negative of the one
-    # by Z.
-    *points, _ = distance.shape
-    n_components = len(_STRESS_AXES)
-    stress = np.zeros((*points, n_components))
-    gradient = np.zeros((*points, n_components, 3))
-    for component, i, j, sign in _AIRY_COMPONENTS:
-        in_plane = differentiate(i, j, chi2, chi3, log1, log2)
-        stress[..., component] = sign * in_plane
-        for axis in (0, 1):
-            i1, i2, i3 = sorted((i, j, axis))
-            derivative = third_derivatives[i1, i2, i3]
-            gradient[..., component, axis] = sign * derivative
-        by_z = differentiate(i, j, log2, log3, inv1, inv2)
-        gradient[..., component, 2] = -sign * by_z
+    # Along x, d/dx = d/dc + d/dc*; along y, d/dy = i (d/dc - d/dc*). The depth Z below a force is
+    # -z, so a derivative by z is the negative of the one by Z.
+    traces = [2 * mixed.real, -2 * mixed.imag, -trace_z]
+    deviators = [pure + mixed, 1j * (pure - mixed), -deviator_z]
+    stress = np.zeros((*trace.shape, len(_STRESS_AXES)))
+    gradient = np.zeros((*stress.shape, 3))
+    stress[..., _IN_PLANE] = _combine(trace, deviator)
+    for axis in range(3):
+        gradient[..., _IN_PLANE, axis] = _combine(traces[axis], deviators[axis])
     return stress, gradient
+
+
+def _combine(trace: Array, deviator: Complex) -> Array:
+    """Return C_xx = g_yy, C_yy = g_xx and C_xy = -g_xy (..., 3) from the trace and the deviator of
+    the second derivatives of g."""
+    g_yy = (trace - deviator.real) / 2
+    g_xx = (trace + deviator.real) / 2
+    return np.stack([g_yy, g_xx, deviator.imag / 2], axis=-1)
 
 
 def _compute_gauss_points(order: int) -> tuple[Array, Array]:
