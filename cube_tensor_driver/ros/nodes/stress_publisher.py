@@ -152,14 +152,15 @@ class ErrorPublisher:
             stamp_ns: Stamp of their message, in ns since the Unix epoch.
         """
         reconstructor = self._reconstructor
-        if not (reconstructor.compensation.is_active or reconstructor.drift_time):
+        has_errors = reconstructor.compensation.is_active or reconstructor.drift_time
+        if not has_errors or not self._publisher.get_subscription_count():
             return
         self._left_out[rows.cube] = rows.left_out
         is_uncertain = self._is_uncertain.copy()
         is_uncertain[rows.cube] = rows.status & COMPENSATION > 0
         is_worse = is_uncertain & ~self._is_uncertain
         is_due = abs(stamp_ns - self._last_ns) >= ERRORS_PERIOD_NS or is_worse.any()
-        if not is_due or not self._publisher.get_subscription_count():
+        if not is_due:
             return
         self._last_ns = stamp_ns
         self._is_uncertain = is_uncertain
