@@ -57,14 +57,11 @@ def invariants(stress: Real) -> Array:
 
     I1 = tr s in Pa, I2 = (I1^2 - tr s^2) / 2 in Pa^2, and I3 = det s in Pa^3.
     """
-    xx, yy, zz, yz, zx, xy = _split(stress)
-    trace = xx + yy + zz
-    normal_products = xx * yy + yy * zz + zz * xx
-    minors = normal_products - yz**2 - zx**2 - xy**2
-    # The rule of Sarrus adds the products along one diagonal and subtracts those along the other.
-    added_products = xx * yy * zz + 2 * yz * zx * xy
-    determinant = added_products - xx * yz**2 - yy * zx**2 - zz * xy**2
-    return np.stack([trace, minors, determinant], axis=-1)
+    matrices = to_matrix(stress).astype(float)
+    trace = np.trace(matrices, axis1=-2, axis2=-1)
+    trace_of_square = np.einsum("...ij,...ij->...", matrices, matrices)
+    second = (trace**2 - trace_of_square) / 2
+    return np.stack([trace, second, np.linalg.det(matrices)], axis=-1)
 
 
 def von_mises(stress: Real) -> Array:
@@ -73,16 +70,12 @@ def von_mises(stress: Real) -> Array:
     The deviator is the tensor minus the mean of its normal stresses. The result has the unit of the
     stress.
     """
-    xx, yy, zz, yz, zx, xy = _split(stress)
-    normal = (xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2
-    shear = yz**2 + zx**2 + xy**2
-    result: Array = np.sqrt(normal / 2 + 3 * shear)
+    matrices = to_matrix(stress).astype(float)
+    mean = np.trace(matrices, axis1=-2, axis2=-1) / 3
+    deviator = matrices - mean[..., None, None] * np.eye(3)
+    square = np.einsum("...ij,...ij->...", deviator, deviator)
+    result: Array = np.sqrt(1.5 * square)
     return result
-
-
-def _split(stress: Real) -> AnyArray:
-    """Return a stress (..., 6) as an array (6, ...), from which the six components are unpacked."""
-    return np.moveaxis(np.asarray(stress), -1, 0)
 
 
 def traction(stress: Real, normal: ArrayLike) -> Array:
