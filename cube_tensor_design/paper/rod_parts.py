@@ -258,7 +258,7 @@ def _compute_forces(
 ) -> Array:
     """Return the nodal forces (dofs,) of some elements at displacements u (dofs,)."""
     section = bench.section
-    stress = section.material.stress(section.deformation(u))
+    stress = section.material.stress(section.compute_deformation(u))
     return section.forces(stress, elements)
 
 

@@ -73,13 +73,13 @@ class Section:
         entries, self._entry = np.unique(pairs, return_inverse=True)
         self._rows, self._columns = np.divmod(entries, size)
 
-    def node(self, x: float, z: float) -> int:
+    def find_node(self, x: float, z: float) -> int:
         """Return the number of the corner of an element that is nearest to this point."""
         node_x, node_z = self.mesh.p
         distance = np.hypot(node_x - x, node_z - z)
         return int(distance.argmin())
 
-    def deformation(self, u: Array) -> Array:
+    def compute_deformation(self, u: Array) -> Array:
         """Return the gradient of the deformation F = 1 + grad u (2, 2, E, Q) at the quadrature
         points."""
         gradient = self._gradient @ u
@@ -88,7 +88,7 @@ class Section:
 
     def balance(self, u: Array) -> Balance | None:
         """Return nodal forces (dofs,) and energy; None when an element is turned inside out."""
-        f = self.deformation(u)
+        f = self.compute_deformation(u)
         # Linear theory does not limit the change of volume.
         if self.material.finite and det(f).min() <= 0:
             return None
@@ -118,7 +118,7 @@ class Section:
             return self._linear_tangent
         volume = self.basis.dx
         n_elements, n_points = volume.shape
-        moduli = self.material.moduli(self.deformation(u))
+        moduli = self.material.moduli(self.compute_deformation(u))
         weighted = moduli * volume
         by_component = weighted.reshape(4, 4, n_elements, n_points)
         by_point = np.moveaxis(by_component, (0, 1), (2, 3))

@@ -280,15 +280,15 @@ class VirtualBench:
         linear_part = np.einsum("ijk,keq->ijeq", gradient, section.points)
         force = section.forces(stress[:, :, None, None] + linear_part)
         # Three unknowns stop the rigid motions; the loads balance, so they bear no force.
-        centre = section.node(0.0, 0.0)
-        side = section.node(1.0, 0.0)
+        centre = section.find_node(0.0, 0.0)
+        side = section.find_node(1.0, 0.0)
         nodal_dofs = section.basis.nodal_dofs
         pinned = [*nodal_dofs[:, centre], nodal_dofs[1, side]]
         free = np.setdiff1d(np.arange(section.basis.N), pinned)
         u = np.zeros(section.basis.N)
         matrix = section.tangent(u)[free][:, free]
         u[free] = factorise(matrix).solve(force[free])
-        result = section.material.stress(section.deformation(u))
+        result = section.material.stress(section.compute_deformation(u))
         return Deformation(
             points=mesh.p,
             triangles=mesh.t,
@@ -384,7 +384,7 @@ class VirtualBench:
     def _compute_rotation(self, u: Array) -> float:
         """Return the rotation, in rad, of the line between the centres of the cube's two sides."""
         section = self.section
-        ends = [section.node(x, 0.0) for x in (-1.0, 1.0)]
+        ends = [section.find_node(x, 0.0) for x in (-1.0, 1.0)]
         left, right = u[section.basis.nodal_dofs[:, ends]].T
         # The undeformed line is 2 d0 long.
         along_x, along_z = right - left
@@ -396,7 +396,7 @@ class VirtualBench:
         The stress is computed from the nodal forces of the elastomer on the cube.
         """
         section = self.section
-        stress = section.material.stress(section.deformation(u))
+        stress = section.material.stress(section.compute_deformation(u))
         force = -section.forces(stress, ~self.in_cube)
         angle = self._compute_rotation(u) if self.finite else 0.0  # Linear theory has no rotation.
         return self.pad_weights(self.layout, angle) @ force
@@ -406,7 +406,7 @@ class VirtualBench:
         true stress within d0/2 of the centre."""
         section = self.section
         is_near = np.all(np.abs(section.points) < 0.5, axis=0)
-        f = section.deformation(u)
+        f = section.compute_deformation(u)
         stress = section.material.cauchy(f)
         stress = stress[:, :, is_near]
         x = section.points[:, is_near]

@@ -110,7 +110,7 @@ class _Passage:
     width: float
     offset: float
 
-    def field(self, x: Array) -> tuple[Array, Array]:
+    def compute_field(self, x: Array) -> tuple[Array, Array]:
         """Return stress (n, 6) and gradient (n, 6, 3) at x (n, 3), in m from the cube's centre."""
         order = 4 + int(np.ceil(self.width / MAX_POINT_SPACING))
         force = [FRICTION, 0.0, -1.0]
@@ -118,10 +118,10 @@ class _Passage:
         points = x + np.array([0.0, LATERAL_OFFSET, -DEPTH])
         return contact.field(points, sources, forces, POISSONS_RATIO)
 
-    def components(self) -> Array:
+    def compute_components(self) -> Array:
         """Return true stress and gradient (15,) at the cube's centre, in Pa; the gradient is times
         d0, half the side of the cube."""
-        stress, gradient = self.field(np.zeros((1, 3)))
+        stress, gradient = self.compute_field(np.zeros((1, 3)))
         slopes = self.side / 2 * gradient[0, :3]
         return np.concatenate([stress[0], slopes.ravel()])
 
@@ -155,7 +155,7 @@ def study_layouts(
     matrix, pads = _solve_box(passages, progress)
 
     shape = (len(sides), len(widths), len(offsets), len(COMPONENTS))
-    components = [passage.components() for passage in passages]
+    components = [passage.compute_components() for passage in passages]
     truth = np.array(components).reshape(shape)
     error = {}
     for name, layout in LAYOUTS.items():
@@ -196,7 +196,7 @@ def _solve_box(
     def field(x: Array) -> Array:
         key = x.tobytes()
         if key not in known_fields:  # every parity asks for the same points
-            stresses = [passage.field(passage.side / 2 * x)[0] for passage in passages]
+            stresses = [passage.compute_field(passage.side / 2 * x)[0] for passage in passages]
             known_fields[key] = to_matrix(np.stack(stresses, axis=1))
         return known_fields[key]
 

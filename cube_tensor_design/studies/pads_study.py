@@ -137,7 +137,7 @@ def compute_layer_example(true: Influence) -> FieldExample:
     """
     pressure = {}
     for form, bench in _make_benches(THIN[0], true, side=10).items():
-        example = bench.example(5e-3, np.array([2.4e-3, 1.6e-3]))
+        example = bench.compute_example(5e-3, np.array([2.4e-3, 1.6e-3]))
         pressure["truth"] = example.pressure["truth"]
         pressure[form] = example.pressure[METHODS[-1]]
     return replace(example, pressure=pressure)

@@ -193,7 +193,7 @@ class TractionBench:
             cubes = CubeMeasurement(layer, setting.depth, 1.0)
             self._true_layer = ContactResponse(cubes)
 
-    def truth(
+    def compute_truth(
         self,
         points: Array,
         width: float,
@@ -238,7 +238,7 @@ class TractionBench:
         distribute = make_flat_punch if self.setting.shape == "flat punch" else contact.hertz
         return distribute(width / 2, force, centre, order)
 
-    def values(
+    def compute_values(
         self,
         width: float,
         force: Array,
@@ -247,7 +247,7 @@ class TractionBench:
     ) -> Array:
         """Return stress and gradient (cubes, 15), in Pa and Pa/m, that the pipeline computes under
         a load."""
-        return self.measured(self.compute_pads_under(width, force, centre), random)
+        return self.measure(self.compute_pads_under(width, force, centre), random)
 
     def compute_pads_under(
         self,
@@ -257,7 +257,7 @@ class TractionBench:
     ) -> Array:
         """Return the pad stresses (cubes, P), in Pa, under a load."""
         cubes = self.poses.position[:, :2]
-        return self.compute_pads_in(self.truth(cubes, width, force, centre))
+        return self.compute_pads_in(self.compute_truth(cubes, width, force, centre))
 
     def compute_pads_in(self, field: Array) -> Array:
         """Return the pad stresses (cubes, P), in Pa, in a field (cubes, 6 + 18) of stress and
@@ -271,7 +271,7 @@ class TractionBench:
         state = calibration.modes.state(stress, calibration.half_side * gradient)
         return state @ calibration.response.T
 
-    def measured(
+    def measure(
         self,
         pads: Array,
         random: np.random.Generator,
@@ -300,7 +300,7 @@ class TractionBench:
         force = draw_force(random)
         return force, self.setting.pitch * (random.random(2) - 0.5)
 
-    def errors(
+    def compute_errors(
         self,
         width: float,
         cases: int = CASES,
@@ -339,8 +339,8 @@ class TractionBench:
         force, centre = self.load(random)
         # Near the edge of the skin there are cubes on one side only, so it does not count.
         points = self.inverse.points[self.window, :2]
-        true = -self.truth(points, width, force, centre)[:, 2]
-        values = self.values(width, force, centre, random)
+        true = -self.compute_truth(points, width, force, centre)[:, 2]
+        values = self.compute_values(width, force, centre, random)
         interpolated = self.surface.contacts(values, CONTACT_PRESSURE)
         tracker, tracked, pressures = self._solve(values)
         errors = np.array(pressures)[:, self.window] - true
@@ -376,7 +376,7 @@ class TractionBench:
         ]
         return tracker, tracked, pressures
 
-    def example(self, width: float, centre: Array) -> FieldExample:
+    def compute_example(self, width: float, centre: Array) -> FieldExample:
         """Return the pressure at the cubes' depth under one load with friction along x.
 
         The pressures are the true one, that of each of `METHODS`, and the "standard deviation" that
@@ -387,11 +387,11 @@ class TractionBench:
             centre: (2,) position of the contact, in m.
         """
         force = FORCE * np.array([FRICTION, 0.0, -1.0])
-        values = self.values(width, force, centre, np.random.default_rng(1))
+        values = self.compute_values(width, force, centre, np.random.default_rng(1))
         points = self.inverse.points
         tracker, _, pressures = self._solve(values)
         pressure = {
-            "truth": -self.truth(points[:, :2], width, force, centre)[:, 2],
+            "truth": -self.compute_truth(points[:, :2], width, force, centre)[:, 2],
             **dict(zip(METHODS, pressures, strict=True)),
             "standard deviation": tracker.deviation(values).depth_pressure,
         }
@@ -404,7 +404,7 @@ class TractionBench:
         seed: int = 8,
     ) -> list[Errors]:
         """Return the errors for random loads of each width (m); a seed gives the same loads."""
-        return [self.errors(width, cases, seed) for width in widths]
+        return [self.compute_errors(width, cases, seed) for width in widths]
 
 
 class ContactErrors(NamedTuple):
@@ -468,7 +468,7 @@ def compute_traction_example() -> FieldExample:
     """Return the pressure under a contact of 6 mm between planar cubes, every second one turned."""
     setting = Setting(cubes=CUBES[2], pitch=10e-3, depth=4e-3)
     centre = setting.pitch * np.array([0.35, 0.25])
-    return TractionBench(setting, side=10).example(6e-3, centre)
+    return TractionBench(setting, side=10).compute_example(6e-3, centre)
 
 
 def make_flat_punch(

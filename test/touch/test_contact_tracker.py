@@ -72,7 +72,7 @@ def test_a_contact_between_wide_pitches_has_its_force_and_place(
 def test_stated_deviations_are_those_of_the_errors(cubes):
     """Through the whole chain: gains of pads, pad law, counter, pipeline. The number of loads
     leaves 0.65 to 1.35 open."""
-    errors = TractionBench(Setting(cubes=cubes), side=2).errors(8e-3, cases=8)
+    errors = TractionBench(Setting(cubes=cubes), side=2).compute_errors(8e-3, cases=8)
     force, place = errors.ratio[1]
     assert 0.5 < force < 1.6 and 0.5 < place < 1.6
     assert errors.force[1] < 0.01 and errors.position[1] < 0.1e-3 and errors.found == 1
@@ -87,7 +87,7 @@ def test_stated_deviations_are_those_of_the_errors(cubes):
 def test_wrong_data_of_the_elastomer_are_found_or_stated(wrong, shape):
     """Taken for right, they cost 3 % of the force, eleven stated deviations, or five of the place.
     A ball is a Hertz contact, a wide punch is not. Six loads leave 0.6 to 1.5 open."""
-    errors = TractionBench(Setting(shape=shape, **wrong), side=2).errors(15e-3, cases=6)
+    errors = TractionBench(Setting(shape=shape, **wrong), side=2).compute_errors(15e-3, cases=6)
     force, place = errors.ratio[1]
     assert 0.4 < force < 2 and 0.4 < place < 2
     assert errors.force[1] < 0.003 and errors.position[1] < 0.1e-3
@@ -122,7 +122,9 @@ def test_a_flat_punch_is_no_hertz_contact_even_if_far_cubes_fit(inverse, seed):
 def test_between_wide_pitches_the_field_is_that_of_the_fitted_ball(cubes):
     """The linear inverse alone is off by a quarter and more. Eight loads leave 0.65 to 1.35 of the
     calibration ratio open; on the surface, points that lie close together are off together."""
-    errors = TractionBench(Setting(cubes=cubes, pitch=12e-3, depth=4e-3), side=2).errors(5e-3, 8)
+    errors = TractionBench(Setting(cubes=cubes, pitch=12e-3, depth=4e-3), side=2).compute_errors(
+        5e-3, 8
+    )
     assert errors.field[2] < 0.04 < 0.2 < errors.field[1]
     below, surface = errors.field_ratio
     assert 0.6 < below < 1.4 and 0.3 < surface < 2
@@ -133,10 +135,12 @@ def test_the_noise_of_a_cube_is_how_its_values_scatter_with_the_gains_and_the_co
     """In every direction of its components. Pads differ: below a narrow contact some feel ten times
     as much as others, so gains that were off by as many Pa for each would be wrong."""
     bench, random = TractionBench(Setting(cubes=cubes), side=1), np.random.default_rng(7)
-    field = bench.truth(np.array([[1e-3, 2e-3]]), 2e-3, np.array([0.6, 0.3, -3.0]), np.zeros(2))
+    field = bench.compute_truth(
+        np.array([[1e-3, 2e-3]]), 2e-3, np.array([0.6, 0.3, -3.0]), np.zeros(2)
+    )
     count = len(bench.poses.position)
     pads = bench.compute_pads_in(np.repeat(field, count, axis=0))
-    drawn = [bench.inverse.scaled(bench.measured(pads, random)) for _ in range(12)]
+    drawn = [bench.inverse.scaled(bench.measure(pads, random)) for _ in range(12)]
     noise = CubeNoise(bench.inverse)
     noise.update(drawn[0], np.arange(count))
     local = LocalValues(bench.inverse, noise, 0, np.arange(1))
@@ -154,9 +158,9 @@ def test_where_nothing_is_left_the_field_is_as_unsure_as_noise_and_gains_make_it
     predicted of lost cubes counts as independent of what it is predicted from."""
     bench, random = TractionBench(Setting(), side=2), np.random.default_rng(3)
     inverse, force = bench.inverse, np.array([0.6, 0.3, -3.0])
-    field = bench.truth(bench.poses.position[:, :2], 8e-3, force, np.array([1e-3, 2e-3]))
+    field = bench.compute_truth(bench.poses.position[:, :2], 8e-3, force, np.array([1e-3, 2e-3]))
     pads = bench.compute_pads_in(field)
-    drawn = np.stack([inverse.scaled(bench.measured(pads, random)) for _ in range(100)])
+    drawn = np.stack([inverse.scaled(bench.measure(pads, random)) for _ in range(100)])
     drawn[:, lost] = np.nan
     middle = drawn.mean(axis=0)
     below = np.array([inverse.field_of_scaled(values - middle).depth_pressure for values in drawn])
@@ -227,7 +231,7 @@ def test_planar_cubes_six_depths_apart_tell_on_which_side_of_their_row_a_contact
     force, random = np.array([0.6, -0.3, -3.0]), np.random.default_rng(6)
     for centre, width in (((11.7, -4.4), 5e-3), ((6, 9), 5e-3), ((-0.5, 2.5), 2e-3)):
         centre = 1e-3 * np.array(centre)
-        values = bench.values(width, force, centre, random)
+        values = bench.compute_values(width, force, centre, random)
         (found,) = ContactTracker(bench.inverse, LEAST).update(values, max_work=np.inf)
         assert np.linalg.norm(found.position[:2] - centre) < 0.3e-3
         assert found.position_uncertainty < 0.3e-3
@@ -243,7 +247,7 @@ def test_a_contact_midway_between_planar_cubes_is_not_looked_for_beside_another_
     centre, angle = np.array([random.uniform(-4e-3, 4e-3), -11.7e-3]), random.uniform(0, 6.28)
     force = np.array([0.9 * np.cos(angle), 0.9 * np.sin(angle), -3.0])
     (found,) = ContactTracker(bench.inverse, LEAST).update(
-        bench.values(2e-3, force, centre, random), max_work=np.inf
+        bench.compute_values(2e-3, force, centre, random), max_work=np.inf
     )
     assert abs(found.normal_force - 3) < 4 * found.force_uncertainty < 0.1
     assert np.linalg.norm(found.position[:2] - centre) < 0.2e-3
@@ -256,7 +260,7 @@ def test_the_size_of_a_flat_punch_settles():
     random = np.random.default_rng(11)
     load, centre = bench.load(random)
     (found,) = ContactTracker(bench.inverse, LEAST).update(
-        bench.values(10e-3, load, centre, random), max_work=np.inf
+        bench.compute_values(10e-3, load, centre, random), max_work=np.inf
     )
     assert abs(found.normal_force - 3) < 4 * found.force_uncertainty < 0.08
 
@@ -271,7 +275,7 @@ def test_a_fit_from_the_wrong_side_of_a_cube_gets_to_a_contact_half_a_pitch_away
         centre, angle = np.array([4.02e-3 * side, y]), random.uniform(0, 6.28)
         force = np.array([0.9 * np.cos(angle), 0.9 * np.sin(angle), -3.0])
         (found,) = ContactTracker(bench.inverse, LEAST).update(
-            bench.values(5e-3, force, centre, random), max_work=np.inf
+            bench.compute_values(5e-3, force, centre, random), max_work=np.inf
         )
         assert np.linalg.norm(found.position[:2] - centre) < 4 * found.position_uncertainty
 
@@ -282,7 +286,7 @@ def test_a_force_between_two_likely_ones_is_as_uncertain(seed):
     the likelier one is the wrong one: 0.03 N off, 7 deviations of its fit alone, and 0.4 mm."""
     bench = TractionBench(Setting(cubes=CUBES[2]), side=1)
     force, centre = np.array([0.638, -0.635, -3.0]), np.array([3.8e-3, -0.6e-3])
-    values = bench.values(10e-3, force, centre, np.random.default_rng(seed))
+    values = bench.compute_values(10e-3, force, centre, np.random.default_rng(seed))
     (found,) = ContactTracker(bench.inverse, LEAST).update(values, max_work=np.inf)
     assert abs(found.normal_force - 3) < 4 * found.force_uncertainty < 0.1
     assert np.abs(found.position[:2] - centre).max() < 4 * found.position_uncertainty

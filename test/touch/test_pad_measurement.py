@@ -118,7 +118,7 @@ def test_a_contact_on_a_thin_layer(influence):
     forces = []
     for known in (None, influence):
         bench = LayerBench(setting, influence, known, side=2)
-        values = bench.values(5e-3, load, centre, np.random.default_rng(1))
+        values = bench.compute_values(5e-3, load, centre, np.random.default_rng(1))
         (touch,) = ContactTracker(bench.inverse, 300.0).update(values)
         forces.append(touch.force)
     # 1 % of the gains is 0.1 to 0.3 % of the force (docs/contacts.md)
@@ -144,7 +144,7 @@ def test_pads_that_are_left_out_change_what_a_cube_says_and_the_contact_stays(
     near = np.argsort(np.linalg.norm(bench.poses.position[:, :2] - centre, axis=1))[:4]
     for bits in (0, [1, 2, 4, 8], [3, 0, 8, 0], 0):
         left_out[near] = bits
-        values = bench.measured(pads, random, left_out)
+        values = bench.measure(pads, random, left_out)
         finder.update(0.0, values, left_out, np.zeros(n, np.uint16))
         (touch,) = finder.contacts
         assert abs(touch.normal_force - 3) < min(0.05, 4 * touch.force_uncertainty)
@@ -157,7 +157,7 @@ def test_in_the_field_a_cube_without_a_pad_counts_as_missing(influence):
     bench, random = LayerBench(setting, influence, influence, side=1), np.random.default_rng(5)
     inverse, n = bench.inverse, len(bench.poses.position)
     pads = bench.compute_pads_under(5e-3, np.array([0.6, 0.3, -3.0]), np.array([1e-3, -2e-3]))
-    values, pipeline = bench.measured(pads, random), Pipeline([CUBE] * n)
+    values, pipeline = bench.measure(pads, random), Pipeline([CUBE] * n)
     cube, lost = np.array([n // 2]), values.copy()
     lost[cube] = np.nan
     before, expected = inverse.field(values), inverse.field(lost)

@@ -164,7 +164,7 @@ def compute_values_under(
         poisson_error: How much larger Poisson's ratio is.
     """
     pads = _compute_pads_under(bench, forces, centre, force, depth_error, poisson_error)
-    return bench.measured(pads, random)
+    return bench.measure(pads, random)
 
 
 def _compute_pads_under(
