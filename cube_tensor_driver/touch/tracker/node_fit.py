@@ -207,6 +207,8 @@ class NodeFit:
 
         # The response (n, C, 3 q) in Pa/N has the forces in the order of `to_forces`.
         self._response = values.respond(self.places, self.size).astype(np.float32)
+        # `_estimates` are the contacts for the newest values, once they are computed.
+        self._estimates: list[ContactEstimate] = []
         self.is_solved = False
         self.is_settled = False
         self.is_sharp = False
@@ -268,6 +270,7 @@ class NodeFit:
             white: Whitened values (n C,), as for `solve`.
         """
         posterior = self.posterior
+        self._estimates = []
         self._errors = posterior.to_errors @ white
         projected = posterior.response @ white.astype(np.float32)
         unknowns = posterior.shrinkage * (projected - posterior.by_errors @ self._errors)
@@ -296,18 +299,16 @@ class NodeFit:
 
     def estimate_contacts(self) -> list[ContactEstimate]:
         """Return force, centre, moment and area of each contact of the region, by integration."""
+        if self._estimates:
+            return self._estimates
         # For second moments, the force of a node counts as spread over an area as wide as the
         # distance of neighbouring nodes.
         radius = _NODE_RADIUS / NODE_STEP * self.spacing
-        return [
-            estimate_contact(
-                centre,
-                self.forces @ polynomials,
-                np.sqrt(self.misfit) * root,
-                radius,
-            )
-            for centre, polynomials, root in self._contacts
-        ]
+        for centre, polynomials, unit_root in self._contacts:
+            root = np.sqrt(self.misfit) * unit_root
+            estimate = estimate_contact(centre, self.forces @ polynomials, root, radius)
+            self._estimates.append(estimate)
+        return self._estimates
 
     @property
     def shape_misfit(self) -> float:
@@ -423,6 +424,7 @@ class NodeFit:
         reach = 1.5 * self.spacing
         is_neighbour = self._squared_distances < reach**2
         labels = split_peaks(-smoothing @ self.forces[2], smoothing @ normal_root, is_neighbour)
+        self._estimates = []
         # Each contact is described by its centre, the polynomials of its nodes, and a square root
         # of the covariance of its moments.
         self._contacts = []
