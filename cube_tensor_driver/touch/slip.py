@@ -123,6 +123,14 @@ MAX_SHIFT_DEPTHS = 0.2
 """Shift of a contact, divided by the depth of the cubes' centres below the surface, after which the
 derivatives of the cubes' values by the contact's force and position are computed again."""
 
+MIN_SHIFT_DEPTHS = 0.1
+"""Shift of a contact since the contact tracker has fitted it, divided by the depth, up to which
+these derivatives need not be exact, because only this shift is computed with them."""
+
+MAX_FITTED_SHIFT_DEPTHS = 0.5
+"""Shift of a contact, divided by the depth, after which these derivatives are computed again in any
+case."""
+
 MAX_FORCE_CHANGE = 0.3
 """Change of the force of a contact, divided by the force, after which the derivatives of the cubes'
 values by the contact's force and position are computed again, because the radius of the contact
@@ -408,7 +416,9 @@ class SlipEstimator:
         """Return `Slip.partial` (n,)."""
         contacts = self._contacts
         terms, curved = contacts["terms"], contacts["terms"][:, 5:]
-        inverse = np.linalg.pinv(contacts["gram"], rcond=1e-9, hermitian=True)
+        # Terms along the normal are 0, and all terms at the begin of a fit.
+        size = np.trace(contacts["gram"], axis1=1, axis2=2)[:, None, None]
+        inverse = np.linalg.inv(contacts["gram"] + 1e-9 * (size + 1) * np.eye(8))
         parts = terms[:, :, None] * (inverse @ contacts["moments"])
         change = _compute_lengths(parts[:, 2:].sum(axis=1))
         by_pad = np.nan_to_num(self._inverse.by_pad[contacts["first"]["cubes"]])
@@ -519,7 +529,10 @@ class SlipEstimator:
         force_change = _compute_lengths(change[:, :3])
         shift = _compute_lengths(change[:, 3:])
         has_changed = force_change > MAX_FORCE_CHANGE * force
-        has_changed |= shift > MAX_SHIFT_DEPTHS * depth
+        since_fit = _compute_lengths(loads[:, 3:] - contacts["load"][:, 3:])
+        is_inexact = since_fit > MIN_SHIFT_DEPTHS * depth
+        has_changed |= is_inexact & (shift > MAX_SHIFT_DEPTHS * depth)
+        has_changed |= shift > MAX_FITTED_SHIFT_DEPTHS * depth
 
         # After a sudden change, as of a body that bounces, linear extrapolation with the
         # derivatives gives no useful position. The contact then keeps the position of the last
