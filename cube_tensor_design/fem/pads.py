@@ -150,23 +150,14 @@ def compute_interval_weights(
 def _make_line_element(order: int) -> tuple[Array, Array]:
     """Return integrals int phi_i phi_j and int phi_i on [0, 1] of the polynomials phi_i that are 1
     at one of order + 1 equally spaced nodes and 0 at the others."""
-    points, weight = np.polynomial.legendre.leggauss(order + 1)
-    points = (points + 1) / 2
-    weight = weight / 2
-    nodes = np.arange(order + 1) / order
-    powers_at_nodes = np.vander(nodes, increasing=True)
-    powers_at_points = np.vander(points, order + 1, increasing=True)
-    to_nodal = np.linalg.inv(powers_at_nodes)
-    phi = powers_at_points @ to_nodal
-    weighted = phi * weight[:, None]
-    return weighted.T @ phi, weight @ phi
+    powers = np.arange(order + 1)
+    to_nodal = np.linalg.inv(np.vander(powers / order, increasing=True))
+    # The integral of x^i x^j on [0, 1] is 1 / (i + j + 1).
+    products = 1 / (powers[:, None] + powers + 1)
+    return to_nodal.T @ products @ to_nodal, products[0] @ to_nodal
 
 
 def _continue_polynomials(order: int) -> Array:
     """Return the values (order,) at the end 1 of an element [0, 1] of the polynomials that are 1 at
     one of its other nodes and 0 at the rest: binomial coefficients of alternating sign."""
-    values = []
-    for k in range(order):
-        sign = (-1) ** (order - 1 - k)
-        values.append(sign * comb(order, k))
-    return np.array(values, dtype=float)
+    return np.array([(-1.0) ** (order - 1 - k) * comb(order, k) for k in range(order)])
