@@ -265,21 +265,15 @@ def _make_rings(
     around = 1.0 + from_corner.reshape(-1, 2)
     # The corner of the cube is the last point.
     points = np.concatenate([around, [[1.0, 1.0]]])
-    triangles = []
-    for outer in range(0, 8 * n, 8):  # `outer` is the number of the ring's first point.
-        inner = outer + 8
-        # `side` is a point in the middle of a side, between two corners.
-        for side in range(0, 8, 2):
-            outer_side = outer + side
-            for corner in ((side + 1) % 8, (side - 1) % 8):
-                inner_corner = inner + corner
-                # Cut the trapezoid along its shorter diagonal.
-                triangles.append((outer_side, outer + corner, inner_corner))
-                triangles.append((outer_side, inner_corner, inner + side))
+    # The triangles of the first ring; the points of the next ring in are numbered from 8 on.
+    pattern = []
+    for side in range(0, 8, 2):  # The points in the middle of a side, between two corners.
+        for corner in ((side + 1) % 8, (side - 1) % 8):
+            # Cut the trapezoid along its shorter diagonal.
+            pattern += [(side, corner, 8 + corner), (side, 8 + corner, 8 + side)]
+    first_points = 8 * np.arange(n)[:, None, None]
+    rings = (np.array(pattern) + first_points).reshape(-1, 3)
     # The last ring is closed by triangles to the corner of the cube itself.
-    last = 8 * n
-    corner = len(points) - 1
-    for j in range(8):
-        following = (j + 1) % 8
-        triangles.append((last + j, last + following, corner))
-    return points, np.array(triangles)
+    turn = np.arange(8)
+    fan = np.stack([turn, (turn + 1) % 8, np.full(8, 8)], axis=1)
+    return points, np.concatenate([rings, 8 * n + fan])
