@@ -83,8 +83,10 @@ class Thermal:
         self._linear_size, self._ramp_size = (
             np.sqrt((values**2).sum(axis=(1, 2)) / own_pads) for values in (linear, self._ramp)
         )
-        # For a pad that the cube does not have, quotients are 0.
-        self._stiffness = np.where(pipeline.stiffness > 0, pipeline.stiffness, np.inf)
+        # Stresses / stiffness, the highest power first (D, C, P); 0 for a missing pad.
+        stiffness = np.where(pipeline.stiffness > 0, pipeline.stiffness, np.inf)
+        self._relative = np.moveaxis(self._coefficient, 2, 0)[::-1] / stiffness
+        self._endless = np.full(n_cubes, np.inf)
 
         # Time stamp of each cube's row in the last step, in ns, and the last measured temperature,
         # in °C.
@@ -93,7 +95,7 @@ class Thermal:
         # Standard deviation of the elastomer's temperature, in K, because temperatures before the
         # first row or in a gap are unknown.
         self._unknown = np.full(n_cubes, START_KELVIN)
-        self.offset = np.zeros(self._stiffness.shape)
+        self.offset = np.zeros(stiffness.shape)
         self.is_known = np.zeros(n_cubes, bool)
 
     def advance(self, scan: Columns) -> None:
@@ -120,8 +122,7 @@ class Thermal:
         decay = 1 - share.min(axis=0, initial=1.0)
         is_gap = elapsed_ns > MAX_STEP_NS
         final = np.where(is_missing | is_gap, LOST_KELVIN, 0)
-        self._unknown *= decay
-        self._unknown += final * (1 - decay)
+        self._unknown[:] = final + decay * (self._unknown - final)
         self._measured[:] = measured
         self._time_ns[:] = time_ns
         self._update()
@@ -135,9 +136,9 @@ class Thermal:
     def _filter(self, elapsed_s: Real, before: Array, now: Array) -> Array:
         """Advance the filters by intervals (C,), in s, between temperatures (C,), in °C."""
         # An unknown temperature does not change, so any number may stand for it.
-        first, last = np.nan_to_num([before, now])[..., None]
-        endless = np.full(len(now), np.inf)
-        return self._filters.advance(elapsed_s, first, last, endless)
+        first, last = inputs = np.array([before, now])[..., None]
+        inputs[np.isnan(inputs)] = 0
+        return self._filters.advance(elapsed_s, first, last, self._endless)
 
     def _update(self) -> None:
         """Compute `offset` and `is_known` from the state."""
@@ -145,10 +146,9 @@ class Thermal:
         temperature = self._filters.output[:, 0]
         level = np.where(is_measured, temperature - self._reference, 0)
         self.offset[:] = 0
-        for degree in range(self._coefficient.shape[2] - 1, -1, -1):
-            self.offset += self._coefficient[..., degree]
+        for coefficient in self._relative:
+            self.offset += coefficient
             self.offset *= level[:, None]
-        self.offset /= self._stiffness
         behind = np.abs(self._measured - temperature)
         deviation = self._ramp_size * behind + self._linear_size * self._unknown
         # The comparison is false for NaN, which means that no temperature has been measured so far.
