@@ -80,7 +80,7 @@ class LinkState(str, Enum):
 
     Attributes:
         CLOSED: The link is not in use.
-        WAITING: The port is not open; it is tried again every 1.5 s.
+        WAITING: The port is not open; it is tried again every second.
         OPEN: The port is open.
         SILENT: The port is open, but no sample has come for max(3 sample periods, 0.2 s) although
             samples were requested.

@@ -36,7 +36,7 @@ so that the requests fall on all phases of the sample period in turn."""
 REOPEN_S = 5.0
 """Time without a received byte, in s, after which a link is closed and opened again. A working hub
 sends HELLO every second, so after this time the open port leads to no working hub."""
-PAUSE_S = 1.5
+PAUSE_S = 1.0
 """Pause between two attempts to open a link, in s. A link should be open again within 2 s."""
 CHECK_PORT_S = 0.25
 """Period, in s, at which a link whose port is not open checks whether the device file of the port
