@@ -141,7 +141,6 @@ class Session:
         """
         link = self.link
         link.close()
-        self._ports = link.identify_ports()
         self._retry_at = time.monotonic() + PAUSE_S
         self.set_state(LinkState.WAITING, error)
 
