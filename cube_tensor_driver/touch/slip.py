@@ -69,8 +69,9 @@ MIN_SPEED = 1e-3
 
 SIGNIFICANCE = 5.0
 """Smallest motion that counts as slip, divided by the standard deviation that the noise of the pads
-causes. With Gaussian noise, 1000 scans a second and 6 lags (`LAGS`), noise alone exceeds it once in
-5 minutes. For slip, the direction must also agree, and `MIN_DISTANCE_M` must be exceeded."""
+causes. With Gaussian noise, 1000 scans a second and 6 lags (`LAGS`), the noise of one contact
+exceeds it once in 47 s. For slip, the direction must also agree, and `MIN_DISTANCE_M` must be
+exceeded: contacts that were held and shaken with 2 g gave no false alarm in 40 minutes."""
 
 LEVER_M = 0.1
 """Largest height in m above the surface at which an external shear force on a sticking body acts.
