@@ -257,6 +257,7 @@ def test_programs_of_a_page_run(name):
             poses=poses, calibrations=[illustrative("planar")], elastomer=None, rate=None
         ),
         "source": (),
+        "reconstruct": types.SimpleNamespace(errors=None),
         "poses": poses,
         "values": np.zeros((1, 15)),
     }
