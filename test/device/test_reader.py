@@ -153,7 +153,8 @@ class Watch:
 
     def mark(self) -> None:
         """Send IDENTIFY, which the reader never sends, to mark a time among the requests."""
-        self.reader.links[0].write(encode(Request(Command.IDENTIFY)))
+        # `Link.write` is for the reader's thread only: it changes the bytes that wait to be sent.
+        os.write(self.reader.links[0].fileno(), encode(Request(Command.IDENTIFY)))
 
     def _on_state(self, link: int, state: LinkState, error: LinkError | None) -> None:
         self.states.put((link, state, error, time.monotonic()))
