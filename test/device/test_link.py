@@ -351,6 +351,15 @@ def test_tcp_no_answer(deaf: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert failed.value.kind == "no_answer"
 
 
+def test_pauses_double_up_to_the_limit() -> None:
+    usb = Link(LinkConfig("a", "/dev/x"))
+    assert [usb.increase_pause() for _ in range(7)] == [0.25, 0.5, 1.0, 2.0, 4.0, 5.0, 5.0]
+    usb.reset_pause()
+    assert usb.increase_pause() == 0.25
+    tcp_link = Link(LinkConfig("a", "socket://127.0.0.1:1"))
+    assert [tcp_link.increase_pause() for _ in range(5)] == [0.25, 0.5, 1.0, 1.5, 1.5]
+
+
 def test_pattern_tries_the_matches_in_turn(tmp_path: Path, pty: tuple[int, str]) -> None:
     (tmp_path / "hub0").write_bytes(b"")
     (tmp_path / "hub1").symlink_to(pty[1])

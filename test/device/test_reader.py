@@ -334,8 +334,11 @@ def test_replugged_under_a_new_device(start: Start, tmp_path: Path) -> None:
     hub.unplug()
 
 
-def test_the_return_of_a_port_ends_the_pause(start: Start, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(session_module, "PAUSE_S", 60.0)
+def test_return_after_a_long_absence_resets_the_pause(
+    start: Start, tmp_path: Path, monkeypatch
+) -> None:
+    """The pause has grown to its limit; the port's return ends it."""
+    monkeypatch.setattr("cube_tensor_driver.device.links.link.MIN_PAUSE_S", 60.0)
     port = tmp_path / "hub"
     watch = start(LinkConfig("a", str(port)))
     watch.state(LinkState.WAITING, "no_port")
@@ -450,6 +453,16 @@ def test_hub_that_does_not_answer_is_asked_again(start: Start, hub: PtyHub, monk
     for _ in range(3):
         hub.expect(Command.HELLO)
     hub.greet()
+
+
+def test_answer_of_the_hub_resets_the_pause(start: Start, hub: PtyHub) -> None:
+    watch = start(LinkConfig("a", hub.port))
+    watch.state(LinkState.OPEN)
+    for _ in range(5):
+        watch.reader.links[0].increase_pause()
+    hub.greet()
+    watch.frame(Hello)
+    assert watch.reader.links[0].increase_pause() == 0.25
 
 
 def test_samples_that_are_handled_in_c_are_no_silence(hub: PtyHub) -> None:

@@ -42,6 +42,14 @@ from delaying the reading of the other links."""
 MAX_UNSENT = 4096
 """Largest number of bytes that may wait to be sent on one link. Bytes wait only if the hub does not
 read; at the limit the link is closed and opened again."""
+MIN_PAUSE_S = 0.25
+"""Pause after the first failed attempt to open a link, in s. Each further failure doubles it."""
+MAX_PAUSE_S = 5.0
+"""Longest pause between two attempts to open a serial port, in s. If the device file of the port
+appears or changes, because a hub was plugged in, the next attempt follows without this pause."""
+MAX_TCP_PAUSE_S = 1.5
+"""Longest pause between two attempts to open a TCP link, in s. Unlike a device file, a TCP peer
+gives no sign when it can be reached again, and a link should be open again within 2 s."""
 END_OF_STREAM = OSError(errno.EIO, "end of stream")
 """Error for a read that returned no byte although the port was ready: the other end was unplugged
 or has closed the connection."""
@@ -80,7 +88,7 @@ class LinkState(str, Enum):
 
     Attributes:
         CLOSED: The link is not in use.
-        WAITING: The port is not open; it is tried again every second.
+        WAITING: The port is not open; it is tried again after a pause of at most 5 s.
         OPEN: The port is open.
         SILENT: The port is open, but no sample has come for max(3 sample periods, 0.2 s) although
             samples were requested.
@@ -161,6 +169,7 @@ class Link:
         self._connecting: TcpConnection | None = None
         self._fd = -1
         self._out = bytearray()
+        self._pause = MIN_PAUSE_S
         self._first_match = 0  # index, among the paths that match the pattern, of the next to try
         problem = find_port_problem(config.port)
         if problem:
@@ -329,6 +338,22 @@ class Link:
             self.decoder.reset()
         self._fd = -1
         self._out.clear()
+
+    def increase_pause(self) -> float:
+        """Return the pause before the next attempt to open the link, and double it for later.
+
+        The pauses are 0.25, 0.5, 1 … at most 5 s (serial) or 1.5 s (TCP).
+        """
+        pause = self._pause
+        self._pause = min(2 * pause, MAX_TCP_PAUSE_S if self._tcp else MAX_PAUSE_S)
+        return pause
+
+    def reset_pause(self) -> None:
+        """Set the pause before the next attempt to open the link to the shortest one.
+
+        It is called when the hub has answered or the device file of the port has changed.
+        """
+        self._pause = MIN_PAUSE_S
 
     def skip_match(self) -> None:
         """Make the next attempt begin with the next path that matches the pattern of the port.

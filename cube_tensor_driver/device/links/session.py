@@ -36,8 +36,6 @@ so that the requests fall on all phases of the sample period in turn."""
 REOPEN_S = 5.0
 """Time without a received byte, in s, after which a link is closed and opened again. A working hub
 sends HELLO every second, so after this time the open port leads to no working hub."""
-PAUSE_S = 1.0
-"""Pause between two attempts to open a link, in s. A link should be open again within 2 s."""
 CHECK_PORT_S = 0.25
 """Period, in s, at which a link whose port is not open checks whether the device file of the port
 has appeared or changed."""
@@ -119,6 +117,7 @@ class Session:
             if ports != self._ports:
                 self._ports = ports
                 self._retry_at = now
+                link.reset_pause()
         if now < self._retry_at:
             return False
         if link.state is LinkState.CLOSED:
@@ -141,7 +140,8 @@ class Session:
         """
         link = self.link
         link.close()
-        self._retry_at = time.monotonic() + PAUSE_S
+        self._ports = link.identify_ports()
+        self._retry_at = time.monotonic() + link.increase_pause()
         self.set_state(LinkState.WAITING, error)
 
     def set_period(self, period_us: int) -> None:
@@ -290,6 +290,7 @@ class Session:
                 "wrong_hub",
             )
         link.hello = frame
+        link.reset_pause()
         self.actual_us = frame.period_us
         # A hub may round or refuse the requested period. The period in its answer is accepted, so
         # that the request is not repeated at every HELLO.
