@@ -274,7 +274,8 @@ def test_stated_deviations_contain_errors_that_all_cubes_have_in_common(make_ski
 
 
 def test_several_scans_in_one_call_give_the_same(make_skin):
-    """With a cube that is missing in a scan, values that are not known, and pads left out."""
+    """With a cube that is missing in a scan, one that the skin does not have, values that are not
+    known, and pads left out."""
     run = Run(make_skin(6, known=True))
     load = run.ball((0.1, 0.0, -0.5), (1e-3, 2e-3))
     scans = [run.rows(load if number > 70 else 0.0) for number in range(100)]
@@ -283,6 +284,9 @@ def test_several_scans_in_one_call_give_the_same(make_skin):
     scans[50].left_out[7:9] = 1
     for number in (60, 61, 62, 75):
         scans[number] = scans[number].select(np.arange(36) != 0)
+    stranger = scans[30].select(np.array([35]))
+    stranger.cube[:] = 99
+    scans[30] = concatenate([scans[30], stranger])
     one_by_one = [found for rows in scans for found in run.touch(rows)]
     other = Touch(run.skin)
     together = [
