@@ -410,12 +410,17 @@ class ContactTracker:
         # A shear force tilts the pressure: it shifts its centre at a depth, in proportion to this.
         moments = pressing @ unroll_points(inverse, region.home, own) - inverse.depth * force[:2]
         area = len(region.points) * inverse.area
-        variance = (COARSE_DEVIATION * normal_force) ** 2
+        # An error changes the pressure at all points together.
+        error = float(weight @ inverse.error_deviation[own])
+        error_share = error / max(normal_force, 1e-12)
+        radius = np.sqrt(weight.sum() / np.pi)
+        shift = np.hypot(COARSE_DEVIATION * inverse.pitch, error_share * radius)
+        variance = (COARSE_DEVIATION * normal_force) ** 2 + error**2
         return ContactEstimate(
             force=force,
             force_covariance=variance * np.eye(3),
             place=moments / max(normal_force, 1e-12),
-            place_variance=np.full(2, (COARSE_DEVIATION * inverse.pitch) ** 2),
+            place_variance=np.full(2, shift**2),
             moment=0.0,
             moment_variance=variance * area,
             area=area,

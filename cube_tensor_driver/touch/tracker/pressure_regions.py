@@ -74,24 +74,20 @@ class PressureRegions:
         Args:
             pressure: Pressure (M,) in Pa at the depth of the cubes, below all points.
             certain: Smallest pressure (M,), in Pa, that is certain to be a contact, below each
-                point. A region needs a point with a larger one. None: 0 at all points.
+                point; None: 0 at all points.
 
         Returns:
             Indices of the points of each region, the region with the largest pressure first.
         """
         largest = float(pressure.max(initial=0.0))
-        threshold = max(self._min_pressure, DETECTION_FRACTION * largest)
+        smallest = max(self._min_pressure, DETECTION_FRACTION * largest)
+        threshold = np.maximum(smallest, 0.0 if certain is None else certain)
         release = RELEASE_FRACTION * threshold
         before = self._inside
         limits = np.where(before, release, threshold)
         self._inside = pressure > limits
         if not np.array_equal(self._inside, before):
             self._regions = self._connect_points()
-        if certain is not None:
-            is_certain = pressure > np.where(before, RELEASE_FRACTION * certain, certain)
-            for region in self._regions:
-                self._inside[region] = is_certain[region].any()
-            self._regions = [region for region in self._regions if self._inside[region[0]]]
         return sorted(
             self._regions,
             key=lambda region: -float(pressure[region].max()),
