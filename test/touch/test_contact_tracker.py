@@ -483,6 +483,16 @@ def test_what_a_scan_has_no_time_for_is_done_in_the_next_ones(monkeypatch):
         assert min(np.hypot(*(one.position[:2] - place)) for place in places) < 0.1e-3
 
 
+def test_before_its_fit_a_contact_has_the_force_and_place_of_the_pressure_below(inverse):
+    """Shear shifts the pressure below by 1.2 mm here. The field on the surface is 25 % off."""
+    centre, force = np.array([2e-3, 3e-3]), np.array([0.9, 0.0, -3.0])
+    values = ball(inverse, 5e-3, centre, force)
+    (found,) = ContactTracker(inverse, LEAST).update(values, max_work=0)
+    assert not found.refined
+    np.testing.assert_allclose(found.force, force, atol=0.15 * 3)
+    np.testing.assert_allclose(found.position[:2], centre, atol=0.5e-3)
+
+
 def test_a_fit_of_an_edge_follows_the_load_without_further_work():
     """Forces are linear in the values as long as the fit stays."""
     bench = TractionBench(Setting(), side=2)

@@ -44,7 +44,7 @@ when the regions beside it are fitted, too."""
 MAX_REGIONS = 32
 """Largest number of regions of contact on one skin; those with the largest pressure are kept."""
 
-MAX_WORK_PER_SCAN = 8.0
+MAX_WORK_PER_SCAN = 10.0
 """Computing work in one scan (set of values of all cubes), in ms (`WORK_MS`), up to which further
 steps of fits are made; the remaining steps are made in the next scans. One step is always made."""
 

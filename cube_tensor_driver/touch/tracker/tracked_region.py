@@ -433,8 +433,12 @@ class TrackedRegion:
         """Return the computing time in ms that a step of this region takes."""
         if work in (Work.MOVE, Work.BEGIN, Work.CHOOSE):
             return WORK_MS[work]
-        area = len(self.points) * self._inverse.area
-        n_nodes = area / (NODE_STEP * self._inverse.depth) ** 2
+        fit = self._prepared or self.fit
+        if isinstance(fit, NodeFit):
+            n_nodes = float(len(fit.places))
+        else:
+            area = len(self.points) * self._inverse.area
+            n_nodes = area / (NODE_STEP * self._inverse.depth) ** 2
         return WORK_MS[work] * min(n_nodes / MAX_NODES, 1.0)
 
     def improve(self, work: Work) -> None:
