@@ -44,7 +44,7 @@ when the regions beside it are fitted, too."""
 MAX_REGIONS = 32
 """Largest number of regions of contact on one skin; those with the largest pressure are kept."""
 
-MAX_WORK_PER_SCAN = 10.0
+MAX_WORK_PER_SCAN = 14.0
 """Computing work in one scan (set of values of all cubes), in ms (`WORK_MS`), up to which further
 steps of fits are made; the remaining steps are made in the next scans. One step is always made."""
 
@@ -84,9 +84,9 @@ class TrackedContact(NamedTuple):
         moment_uncertainty: Standard deviation of the moment, in N m.
         area_uncertainty: Standard deviation of the area, in m^2.
         refined: Whether force, position and moment come from a fit of the traction in the region of
-            contact, and all regions near it are fitted, too. If not, they are less exact: integrals
-            of the linear field (`COARSE_DEVIATION`), or results of a fit near a region that has no
-            fit yet.
+            contact that agrees with the newest values, and all regions near it are fitted, too. If
+            not, they are less exact: integrals of the linear field (`COARSE_DEVIATION`), or results
+            of a fit that is to be repeated.
     """
 
     id: int
@@ -174,8 +174,7 @@ class ContactTracker:
                 contacts.append(self._to_parent_frame(region.home, region.integral, False))
                 continue
             for one in fit.estimate_contacts():
-                is_refined = region.has_fitted_neighbours
-                contacts.append(self._to_parent_frame(fit.values.home, one, is_refined))
+                contacts.append(self._to_parent_frame(fit.values.home, one, region.is_refined))
         pressing = [one for one in contacts if one.normal_force > 0]
         return self._number_contacts(pressing)
 

@@ -161,9 +161,10 @@ WORK_MS = {
     Work.RENEW: 4.5,
     Work.SHARPEN: 4.0,
 }
-"""CPU time in ms that the steps of a region with `MAX_NODES` nodes were measured to take. The work
-in a scan is counted with these numbers, not with a clock, so that a recording gives the same
-contacts again."""
+"""Approximate CPU time, in ms, of the steps of a region with `MAX_NODES` nodes. The work in a scan
+is counted with these numbers, not with a clock, so that a recording gives the same contacts again.
+With twenty contacts, steps were measured to take up to twice as long.
+"""
 
 
 class TrackedRegion:
@@ -326,6 +327,17 @@ class TrackedRegion:
     def has_fitted_neighbours(self) -> bool:
         """Whether all regions in `near` have a fit, so that the response to them is well known."""
         return all(other.fit is not None for other in self.near)
+
+    @property
+    def is_refined(self) -> bool:
+        """Whether all regions near are fitted, and the fit agrees with the newest values.
+
+        It does not if its misfit has grown, or if it is still to be solved for the newest response
+        to other regions.
+        """
+        if not self.has_fitted_neighbours or self._is_misfit_larger:
+            return False
+        return self.next_work in (Work.MOVE, Work.CHOOSE, Work.SHARPEN, Work.NONE)
 
     @property
     def relative_error(self) -> float:
