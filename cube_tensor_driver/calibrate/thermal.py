@@ -374,11 +374,11 @@ def _solve(
 
 
 def _describe(data: Warming, best: _Solution) -> ThermalFit:
-    """Return the model of a solution, with the standard deviations of its values.
+    """Return the result of the fit, with the standard deviations of the coefficients.
 
     Args:
-        data: Averages over blocks of time.
-        best: The solution.
+        data: Temperatures and pad stresses, averaged over blocks of 1 s.
+        best: Solution with the most likely time constants of the low-pass filters.
     """
     lags, behind, columns, weight, values, residual, _ = best
     covariance = residual.T @ residual / max(float(behind @ behind), 1e-12)

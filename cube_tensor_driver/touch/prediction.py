@@ -60,10 +60,9 @@ class MissingValuePrediction:
     The errors of the predictions for different cubes are treated as independent.
 
     Attributes:
-        variance: Increase (cubes, points x 2), in Pa^2, of the posterior variances of two pressures
-            at each surface point around each cube (on the surface, and below it at the cubes'
-            depth) because values are missing. It holds for the prior scale s = 1, and the scale s
-            of the prior standard deviation of the pressure (posterior.py) multiplies it by s^2.
+        variance: Variance (cubes, points x 2) in Pa^2 that the missing values add to the pressure
+            on the surface, and to that at the cubes' depth, at each point around each cube. It is
+            given for the scale s = 1 of the prior (posterior.py), and is to be multiplied by s^2.
     """
 
     def __init__(

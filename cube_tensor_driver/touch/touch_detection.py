@@ -461,8 +461,9 @@ class Touch:
     def _number(self, cube: Index, strength: Array, stamp_ns: int) -> Index:
         """Return the numbers (m,) of the touches of this scan.
 
-        A touch has the number that its cube belonged to in the scan before. From each cube the way
-        up to the neighbour with the largest pressure leads to the touch that it belongs to.
+        Each touched cube belongs to the touch that is reached by going repeatedly to the neighbour
+        with the largest pressure. The number of this touch is stored for the cube. In the next
+        scan, a touch at this cube takes the stored number, so it keeps its number when it moves.
 
         Args:
             cube: Indices (m,) of the cubes of the touches, the one with the largest pressure first.

@@ -36,8 +36,9 @@ temperature was measured or no rows arrived. The deviation approaches it with th
 elastomer."""
 
 MAX_DEVIATION = 30.0
-"""Standard deviation of a pad's stress, in Pa, above which rows get the status bit COMPENSATION: a
-tenth of the pressure that counts as a contact (300 Pa)."""
+"""Standard deviation of the computed thermal stress on the pads of a cube, in Pa, above which the
+cube's rows get the status bit COMPENSATION (the compensation is uncertain). It is a tenth of the
+pressure that counts as a contact (300 Pa)."""
 
 MIN_LAG_S = 1e-3
 """Smallest time constant of a low-pass filter, in s. It replaces a shorter one in a calibration,

@@ -56,7 +56,7 @@ UNKNOWN_CUBE = -4
 """Result of the kernel (the loop over rows of frequencies): it has stopped before a row.
 
 The row has the number of a cube that the skin does not have. If the health of pads is updated, the
-kernel stops before the first row, and no row is processed.
+kernel looks for such rows first, and if there is one, it processes no row at all.
 """
 
 NEEDS_STEP = -5

@@ -23,8 +23,9 @@ MAX_PAUSE_NS = 60_000_000_000
 """Longest pause, in ns, by both clocks, over which the line is continued. After a longer one, the
 error of the drift, up to 6 ms per minute, would look like a step."""
 MIN_STEP_US = 4000.0
-"""Smallest deviation, in µs, of a device time from the sample period at which a step is suspected.
-Steps of 5 ms shall be found; 1 ms is left for the jitter of the hub."""
+"""Smallest difference, in µs, between the device time that has elapsed since an earlier sample and
+the sample periods in between, at which a step of the hub's clock is suspected. Steps of 5 ms shall
+be found; 1 ms is left for the jitter of the hub."""
 PERIOD_SAMPLES = 64
 """Time constant, in samples, of the low-pass filter that estimates the sample period."""
 DECISION_NS = 200_000_000
@@ -39,8 +40,8 @@ MAX_STEPS = 3
 STEPS_NS = 10_000_000_000
 """Length, in ns, of the time window in which steps are counted."""
 MAX_BAD_ANSWERS = 3
-"""Number of successive answers to TIME that contradict the samples or earlier answers before this
-is reported and the earlier answers are forgotten."""
+"""Number of successive answers to TIME (request for the hub's device time) that contradict the
+samples or earlier answers, at which a problem is reported and the earlier answers are forgotten."""
 CLOCK_SET = "the hub's clock was set: stamps follow its new time"
 """Problem that is reported after a step of the hub's clock."""
 CLOCK_STANDS_STILL = "the hub's clock stands still: rows are stamped by their arrival"

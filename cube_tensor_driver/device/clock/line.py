@@ -28,8 +28,8 @@ with the smallest delay."""
 MAX_BUCKETS = 120
 """Number of newest points to which the line is fitted, together two minutes."""
 MIN_BUCKETS_FOR_DRIFT = 5
-"""Number of points from which on the drift is estimated. In a shorter time, a change of the delay
-would look like drift."""
+"""Smallest number of points, one for each bucket of 1 s, from which the drift of the hub's clock is
+estimated. Within fewer seconds, a change of the delay would look like drift."""
 UNKNOWN_DRIFT = 1e-4
 """Largest assumed error of a drift from one point: quartz crystals deviate by less than 100 ppm.
 With n points it is n times smaller."""
@@ -44,7 +44,8 @@ was set. Steps of 5 ms shall be found."""
 MAX_DELAY_NS = 60_000_000_000
 """Longest credible delay between sampling and arrival, in ns."""
 JITTER_POINTS = 64
-"""Time constant, in reads of the link, of the low-pass filter that estimates the mean height."""
+"""Time constant, in reads of the link, of the low-pass filter that estimates the jitter: the mean
+height of the points above the line, which is their mean delay beyond the smallest."""
 
 
 class ClockLine:

@@ -177,8 +177,8 @@ class HertzFit:
         # first scan of a fit there are none.
         self._previous: Discs | None = None
         n_contacts = len(starts.forces)
-        # `_change` are the changes of the parameters by the last step. Flatness and moment are 0 at
-        # the contacts at which the response is linearised.
+        # `_change` are the changes of the parameters by the last step. Every step begins with
+        # flatness and moment 0, so the changes of these two are their values.
         self._change = np.zeros((n_contacts, _N_PARAMETERS))
         flatness_deviation = 1.0
         moment_deviation = FORCE_DEVIATION * depth
@@ -531,9 +531,9 @@ def _linearise_alike(
     by_contact = by_contact.astype(float)
     by_force = by_contact[:, :, :, :3]
     values = np.einsum("kjnac,kja->knc", by_force, forces)
-    # `first` and `second` are derivatives by the logarithm of the radius. With h = FLATNESS_STEP,
-    # the response to the difference of contact and mixture that defines the flatness is
-    # h^2 (first - second / 2), to order h^2.
+    # The derivative by the flatness is the response to a contact minus that to a mixture of a wider
+    # and a narrower one (see `FLATNESS_STEP`, h). With the derivatives `first` and `second` by the
+    # logarithm of the radius, it is h^2 (first - second / 2), to order h^2.
     first = by_contact[:, :, :, 5]
     second = by_contact[:, :, :, 6]
     by_contact[:, :, :, 6] = FLATNESS_STEP**2 * (first - second / 2)

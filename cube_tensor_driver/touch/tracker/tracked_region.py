@@ -493,7 +493,10 @@ class TrackedRegion:
             self.response[self.fit.values.cubes] = self.fit.explained
 
     def _whiten(self, values: LocalValues) -> Array:
-        """Return the newest values of cubes minus the response to other regions, whitened."""
+        """Return the newest values (n C,) of the cubes of a fit, whitened (noise of variance 1).
+
+        The response of these cubes to the contacts of other regions is subtracted first.
+        """
         return values.whiten(self._noise.scaled, self.others)
 
     def _iterate(self, fit: HertzFit, steps: int) -> None:
