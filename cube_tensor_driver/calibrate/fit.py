@@ -325,11 +325,11 @@ class _Model:
         self.gains = rows.reshape(-1, n_pads).T
 
     def unpack(self, theta: Array) -> tuple[Array, Array]:
-        """Return the coefficients (K,), fixed ones included, and the gains (P,) of parameters.
+        """Convert parameters to all coefficients of the response (K,) and the pads' gains (P,).
 
         Args:
-            theta: Parameters: the coefficients of the response that are not fixed, then the
-                coordinates that are multiplied by the matrix `gains`.
+            theta: Parameters: the coefficients that are not fixed, then the coordinates of the
+                gains. The gains are 1 plus the matrix `gains` times the coordinates.
         """
         coefficients = self._fixed.copy()
         coefficients[self.free] = theta[: len(self.free)]

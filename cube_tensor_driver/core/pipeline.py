@@ -259,11 +259,11 @@ class Pipeline:
         return shifted
 
     def shift_of_zero(self, before: Array) -> Array:
-        """Return the stress of unloaded pads that older rest frequencies would yield (cubes, P).
+        """Return by how much stresses were too high because of older rest frequencies (cubes, P).
 
-        The rest frequency of a pad is its frequency without load. The stress is computed for the
-        present rest frequencies as if the older ones were valid, and is divided by the stiffness
-        of the pads (no unit). It is 0 where both rest frequencies are equal.
+        The rest frequency of a pad is its frequency without load. The result is the stress,
+        divided by the stiffness of the pad (no unit), that follows from the present rest frequency
+        if the older one is taken for the frequency without load.
 
         Args:
             before: The older rest frequencies (cubes, P), in Hz.

@@ -236,8 +236,8 @@ def find_structure(
     images_of_first = set(pad_images[:, 0])
     is_one_orbit = len(images_of_first) == layout.n_pads
     if is_one_orbit and layout.planar and layout.pads[0] == "+z-x":
-        # The group maps pad V1 onto every other pad, so the letters of Kiyota & Shinoda for the row
-        # of V1 name all entries.
+        # Kiyota & Shinoda denote the coefficients of pad V1 by letters. The group maps V1 onto
+        # every other pad, so the coefficients of the other pads are the same, except for signs.
         letters = _PAPER_LETTERS if "xz" in modes.names else _LETTERS
 
     is_assigned = np.zeros((layout.n_pads, modes.n_modes), dtype=bool)

@@ -56,10 +56,10 @@ MIN_HEIGHT = 4 * MIN_SQUARE
 (`NUMBER_GRID`), covers at most half of it."""
 
 MAX_AGE_NS = 5_000_000
-"""Maximum age, in ns, of a sample that may still be missing in the frame that is read.
+"""Maximum age, in ns, of the newest sample when a frame is made. `next_picture` waits for a newer
+one, but at most for `CATCH_UP_S`.
 
-If the sampling period is longer, the period is the maximum age: within it a cube need not have a
-new sample.
+If the sampling period is longer, the period is the maximum age, because no newer sample need exist.
 """
 
 CATCH_UP_S = 0.02

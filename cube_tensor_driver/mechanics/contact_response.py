@@ -106,16 +106,18 @@ class ContactResponse:
         variant: Index,
         size: float,
     ) -> Array:
-        """Compute the measured components under a Hertz contact with a force of 1 N.
+        """Compute what N cubes measure under a Hertz contact with a force of 1 N.
 
         Args:
             place: Positions (N, 2) of the cubes from the centre of the contact, in m.
             angle: Rotations (N,) of the cubes about z, in rad.
-            variant: Index (N,) of each cube's variant in the measurement model.
+            variant: Index (N,) of each cube's variant in the measurement model. Cubes with the same
+                calibration and the same pads in use are one variant.
             size: Radius of the contact in m.
 
         Returns:
-            Components (N, 15, 3) in Pa/N, for a force along x, y and z.
+            Six stresses and nine gradients (N, 15, 3) at each cube, in Pa/N, for a force along x, y
+            and z. Gradients are multiplied by a length (`CubeMeasurement`).
         """
         table = self._interpolate_size(self._response, size, place)
         circular = self._rotate_loads(table, place, angle, self._order)

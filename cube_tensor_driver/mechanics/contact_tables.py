@@ -59,12 +59,12 @@ depth of the cubes. The function asinh makes the grid fine near the cube and coa
 """
 
 MAX_LEG_RATIO = 50.0
-"""Largest tabulated ratio t / sqrt(1 + d**2) of the polygon tables.
+"""Largest distance along a polygon's edge for which the polygon tables have entries, divided by the
+distance of the line through this edge from the centre of the cube.
 
-d is the distance of the line through a polygon's edge from the point of the surface above the cube.
-t is the length along this line, from the point that is nearest to the cube. Both are divided by the
-depth of the cubes' centres. Longer edges are cut off at this ratio, because traction farther away
-hardly causes any stress at the cube.
+The distance along the edge is counted from the point of the line that is nearest to the cube. An
+edge that reaches farther is cut off there, because traction farther away hardly causes any stress
+at the cube. With d and t as for `GRID_STEP`, the ratio is t / sqrt(1 + d**2).
 """
 
 _LAST_DISTANCE = REACH_DEPTHS * POINTS_PER_DEPTH

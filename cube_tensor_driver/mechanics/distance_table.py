@@ -14,9 +14,8 @@ import numpy as np
 from ..core.arrays import Array
 
 POINTS_PER_DEPTH = 32
-"""Number of tabulated distances between load and cube per length of one depth (of the cubes'
-centres below the surface). The error of the cubic interpolation between them is 1e-4 of the largest
-value."""
+"""Depth of the cubes' centres below the surface, divided by the step of the tabulated distances
+between load and cube. The error of the cubic interpolation is then 1e-4 of the largest value."""
 
 REACH_DEPTHS = 20
 """Largest tabulated distance along the surface from a load to a cube, divided by the depth of the
@@ -34,12 +33,12 @@ _DERIVATIVE = np.diag([1.0, 2.0, 3.0], -1)
 """Matrix (4, 4) from the coefficients of a cubic polynomial to those of its derivative."""
 
 _SLOPE = _VALUE @ _DERIVATIVE
-"""Coefficients (4 table entries, 4 powers) of the first derivatives of the polynomials whose
-coefficients are `_VALUE`."""
+"""Coefficients (4 table entries, 4 powers) of the first derivatives of the four interpolation
+polynomials, whose own coefficients are `_VALUE`."""
 
 _CURVATURE = _SLOPE @ _DERIVATIVE
-"""Coefficients (4 table entries, 4 powers) of the second derivatives of the polynomials whose
-coefficients are `_VALUE`."""
+"""Coefficients (4 table entries, 4 powers) of the second derivatives of the four interpolation
+polynomials, whose own coefficients are `_VALUE`."""
 
 _CUBIC_LAGRANGE = np.stack([_VALUE, _SLOPE, _CURVATURE])
 """Coefficients (3, 4 table entries, 4 powers) of the weights of cubic Lagrange interpolation, and

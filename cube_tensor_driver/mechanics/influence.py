@@ -146,7 +146,9 @@ def write_influence(
 
 
 def read_influence(path: Path) -> Influence:
-    """Read and check influence functions that were computed in space (three force components).
+    """Read and check influence functions of a 3-D model (forces along x, y and z).
+
+    A file of a plane model is refused.
 
     Args:
         path: File (.npz) as from `write_influence`.

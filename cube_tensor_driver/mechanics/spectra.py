@@ -179,16 +179,19 @@ class Spectra:
         bessel: BesselTable,
         prior: Array,
     ) -> Array:
-        """Integrate products of spectra, Bessel functions and the prior spectrum over k.
+        """Compute covariances of components at two positions, as integrals over the wavenumber k.
+
+        The integrals are those of <c d*> or <c d> at the head of this file, without their phases.
 
         Args:
-            spectrum: Products (waves, n, n') of the spectra of n and n' circular components.
+            spectrum: Factor (waves, n, n') of S in the integral, for each pair of n components at
+                one position and n' at the other.
             order: Order (n, n') of the Bessel function for each pair of components.
-            bessel: Bessel functions at the distances of the result.
-            prior: Spectrum S (waves,) of the pressure.
+            bessel: Bessel functions at the distances between the two positions.
+            prior: Spectrum S (waves,) of the random pressure on the surface.
 
         Returns:
-            Integrals (distances, n, n').
+            Covariances (distances, n, n').
         """
         n_distances = len(bessel(0))
         result = np.zeros((n_distances, *order.shape))

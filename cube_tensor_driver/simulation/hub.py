@@ -123,7 +123,7 @@ class SimulatedHub:
         return self.boot_us + now_us + gained
 
     def _compute_positive_device_us(self, now_us: int) -> int:
-        """Return the hub's clock in µs for a frame, which has 0 instead of negative values."""
+        """Return the hub's clock in µs, or 0 if it is negative: frames hold unsigned times."""
         return max(0, self.device_us(now_us))
 
     def set_clock(

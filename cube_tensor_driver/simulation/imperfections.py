@@ -117,7 +117,8 @@ _SCHEMA = Schema(
 """Schema of the file of imperfections."""
 
 _TABLES = {"creep", "temperature", "air", "poses"}
-"""Names of the fields of `Imperfections` that hold rows of numbers."""
+"""Names of the fields of `Imperfections` that hold rows of numbers. Their rows are lists in a file
+and tuples in an instance, so they are converted."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -51,9 +51,9 @@ distances, the pressures were lower.
 """
 
 CERTAIN_DEVIATIONS = 2.5
-"""Smallest pressure of a new contact, in standard deviations of the pressure that errors of the
-compensation cause. In the case of `UNCERTAIN_PRESSURE`, unloaded cubes gave 1.0 and 2.0 standard
-deviations at most."""
+"""Smallest pressure of a new contact, divided by the standard deviation of the pressure that errors
+of the compensation cause. In the two cases that `UNCERTAIN_PRESSURE` describes (warming ground,
+without and with a tare before), the ratio was at most 1.0 and 2.0 at unloaded cubes."""
 
 
 @dataclass(frozen=True)

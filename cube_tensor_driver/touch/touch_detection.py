@@ -112,8 +112,8 @@ NO_TOUCH = -1
 """Number in place of the number of a touch where there is no touch."""
 
 ERRORS_PERIOD_NS = 100_000_000
-"""Time, in ns, after which the errors of the compensation at a touch are computed again. Creep and
-the effect of temperature are computed in the same period."""
+"""Time, in ns, after which the errors that imperfect compensation and drift cause at touched cubes
+are computed again. The compensation computes creep and the effect of temperature as often."""
 
 PRESSURE = COMPONENTS.index("zz")
 """Index in `COMPONENTS` of the stress zz, whose negative is the pressure."""
@@ -377,8 +377,9 @@ class Touch:
         """
         margin = self._margin[cube]
         if self._held.any() or margin.any():
-            # While the slow part of a cube is held, drift and the rest of an earlier load must not
-            # count as touch.
+            # A load nearby stops the update of a cube's slow part (`_held`), so drift is no longer
+            # removed from the pressure. The margin grows with it, so that neither drift nor what
+            # remains of an earlier load counts as touch.
             remainder = REMAINDER * np.abs(pressure)
             growing = np.fmax(margin, remainder) + MAX_DRIFT * elapsed_s
             fading = (1 - elapsed_s / TIME_CONSTANT_S) * margin

@@ -33,12 +33,11 @@ DONE = -1
 """Result of the kernel (the loop over rows of frequencies): all rows are processed."""
 
 NEEDS_WINDOW = -2
-"""Result of the kernel (the loop over rows of frequencies): it has stopped before a scan
-(at most one row of each cube).
+"""Result of the kernel: the next scan (at most one row of each cube) needs a new window of 0.5 s,
+over which the health of pads is assessed.
 
-The newest time stamp of the scan lies outside the present window of 0.5 s, over which the health of
-pads is assessed. The caller ends this window, opens another, and calls the kernel again from that
-scan on.
+The newest time stamp of the scan lies outside the present window, so the kernel has stopped before
+the scan. The caller ends this window, opens another, and calls the kernel again from this scan on.
 """
 
 NEEDS_CONDITION = -3
@@ -60,12 +59,11 @@ kernel looks for such rows first, and if there is one, it processes no row at al
 """
 
 NEEDS_STEP = -5
-"""Result of the kernel (the loop over rows of frequencies): it has stopped before a scan
-(at most one row of each cube).
+"""Result of the kernel: the next scan (at most one row of each cube) needs new values of creep and
+of the effect of temperature, which are computed for a time step (`Offsets.step_ns`).
 
-The newest time stamp of the scan lies outside the present step of the compensation,
-`Offsets.step_ns`. The caller advances creep and temperature, and calls the kernel again from that
-scan on.
+The newest time stamp of the scan lies outside this step, so the kernel has stopped before the scan.
+The caller computes the values for the next step, and calls the kernel again from this scan on.
 """
 
 MAX_GAP_NS = 5_000_000_000

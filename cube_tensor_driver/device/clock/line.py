@@ -26,7 +26,8 @@ BUCKET_NS = 1_000_000_000
 """Length, in ns, of the time intervals (buckets) of which each gives the line one point: the sample
 with the smallest delay."""
 MAX_BUCKETS = 120
-"""Number of newest points to which the line is fitted, together two minutes."""
+"""Maximum number of points to which the clock line (host time over device time) is fitted. They are
+the points of the newest buckets: two minutes, with one point per second."""
 MIN_BUCKETS_FOR_DRIFT = 5
 """Smallest number of points, one for each bucket of 1 s, from which the drift of the hub's clock is
 estimated. Within fewer seconds, a change of the delay would look like drift."""

@@ -355,8 +355,8 @@ class SampleAccount:
         first = frame.first_cube
         self._end_parts(first + 1, first + frame.n_cubes)
         if first not in self._trackers:
-            # Only the tracker of frames from cube 0 on shares its memory with the module in C,
-            # which counts only samples that come whole in one frame.
+            # The module in C counts only samples that come whole in one frame, which begins with
+            # cube 0. So only the tracker of such frames shares the state that the module changes.
             self._trackers[first] = SequenceTracker(None if first else self._track)
         tracker = self._trackers[first]
         tracker.n_cubes = frame.n_cubes
