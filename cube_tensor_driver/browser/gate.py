@@ -47,7 +47,7 @@ MAX_HEAD_S = 10.0
 """Maximum time, in seconds, from the begin of a connection until its request is complete."""
 
 _CHUNK_BYTES = 1 << 18
-"""Maximum number of bytes that are passed on at a time."""
+"""Maximum number of bytes that are read at once, from the browser or from viser, and passed on."""
 
 
 def make_secret_address() -> str:

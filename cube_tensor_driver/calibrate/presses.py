@@ -190,7 +190,7 @@ def compute_expected_presses(
     depth: float = SURFACE_DEPTH,
     distances: Sequence[float] = PRESS_DISTANCES,
 ) -> Array:
-    """Compute the stresses on the pads when a fingertip presses straight down with 1 N.
+    """Compute a cube's pad stresses when a fingertip presses straight down beside it with 1 N.
 
     Source: the elastic half space of `mechanics.contact.field`.
 
@@ -202,8 +202,8 @@ def compute_expected_presses(
             the depth.
 
     Returns:
-        Stresses (rotations, sides, distances, pads), in Pa, tension positive, with the sides in the
-        order of `SIDES`.
+        Stresses (rotations, sides, distances, pads), in Pa, tension positive. A side is a direction
+        from the cube to the finger; the sides are in the order of `SIDES`.
     """
     cube_position = np.array([[0.0, 0.0, -depth]])
     downwards = (0.0, 0.0, -1.0)

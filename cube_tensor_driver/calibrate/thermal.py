@@ -84,9 +84,9 @@ filters only approximate, looks like a quadratic effect while the skin warms onc
 """
 
 MAX_LAG_PATTERNS = 3
-"""Maximum number of principal components of the residual stresses of the pads that become part of
-the model (`ThermalModel.ramp`). They state the error of the model per K of difference between the
-measured temperature and that of the elastomer."""
+"""Maximum number of columns of `ThermalModel.ramp`: errors of the pads' stresses, in Pa per K by
+which the elastomer's temperature lags behind the measured one. The columns are the first principal
+components of the residuals of the fit."""
 
 
 @dataclass(frozen=True, eq=False)

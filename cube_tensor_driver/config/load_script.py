@@ -119,7 +119,7 @@ _SCHEMA = Schema(
         },
     )
 )
-"""Schema of a load script."""
+"""Schema of a load script, the YAML file that states which forces indenters exert over time."""
 
 
 @dataclass(frozen=True)

@@ -27,9 +27,9 @@ class Arrivals:
     """Stores which rows (one cube at one sampling time) have arrived, and when.
 
     Attributes:
-        row_count: (cubes,) number of rows that each stored row of a cube stands for: 1, unless a
-            subclass stores the rows of some cubes only. It is 0 for cubes whose rows are not
-            stored.
+        row_count: (cubes,) number of rows that a stored row of each cube counts as: 1. A subclass
+            may store the rows of one cube per hub, which then count for all cubes of the hub; cubes
+            whose rows are not stored have 0.
         rows: Number of rows that have arrived, stored or not.
     """
 

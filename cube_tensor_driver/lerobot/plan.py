@@ -51,11 +51,11 @@ many samples into one frame, the size of the whole data set would be multiplied.
 """
 
 ALWAYS_ALLOWED_COUNT = 100
-"""Number of frames of an episode, and number of samples in a frame, that are added to the limits
-which `MAX_STAMP_RATIO` and `MAX_DEPTH_RATIO` set.
+"""Number that is added to two limits: to the number of frames in an episode that
+`MAX_STAMP_RATIO` allows, and to the number of samples in a frame that `MAX_DEPTH_RATIO` allows.
 
-Without this addition, a few samples that were stamped late would exceed the limits in a recording
-of a few frames, although nothing is wrong.
+Without this addition, a recording of a few frames would be rejected for a few samples with late
+stamps, although nothing is wrong.
 """
 
 

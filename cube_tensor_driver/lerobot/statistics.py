@@ -37,10 +37,11 @@ values (5, …), and some of the rows (M, …), for the quantiles."""
 
 
 def describe(rows: AnyArray, is_chosen: Mask) -> Part:
-    """Describe n rows (values of the feature, such as one per frame).
+    """Return the statistics of n rows of a feature, and the rows that are chosen (see `Part`).
 
     Args:
-        rows: (n, …) values, n at least 1. NaN and infinite values are unknown.
+        rows: (n, …) values of the feature, such as one per frame, n at least 1. NaN and infinite
+            values are unknown.
         is_chosen: (n,) whether each row is kept for the quantiles.
     """
     values = np.ma.masked_invalid(rows.astype(np.float64))

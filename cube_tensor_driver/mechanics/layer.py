@@ -306,8 +306,8 @@ def _add_rotated(
         "Lz": {4: c, 3: s},
         "Tz": {4: -s, 3: c},
     }
-    # `load_columns` has the components along L, T and z of unit tractions along x, y and z (indices
-    # 0 to 2).
+    # `load_columns` has the components of unit tractions along x, y and z (indices 0 to 2) in the
+    # wave's axes: L along its wave vector, T across it, and z.
     load_columns: dict[str, dict[int, Array | float]] = {
         "L": {0: c, 1: s},
         "T": {0: -s, 1: c},

@@ -318,7 +318,7 @@ class Simulator:
         link.line.send(link.hub.receive(request, now), now)
 
     def _read_faults(self) -> None:
-        """Schedule the faults that were written into the pipe to begin now."""
+        """Read the faults that other processes wrote into `FAULT_PIPE`, and let them begin now."""
         data = os.read(self._fault_pipe, _PIPE_BYTES)
         for line in data.decode(errors="replace").splitlines():
             try:

@@ -80,7 +80,8 @@ class HubClock:
 
     @property
     def is_steady(self) -> bool:
-        """Whether nothing is in doubt, so that the module in C may convert the next samples."""
+        """Whether the module in C may convert the next device times: the stamps are not in doubt,
+        the sample period is known, and the newest sample came in order."""
         track = self.track
         is_newest = 1000 * (track.newest_us - track.first_us) == track.newest_ns
         is_period_known = track.reference_us == track.newest_us and track.period_us > 0

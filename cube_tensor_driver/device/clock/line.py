@@ -141,7 +141,13 @@ class ClockLine:
         return True
 
     def _add_bucket(self, height: float) -> bool:
-        """Fit the line with the point of one more bucket; return whether a clock was set."""
+        """Fit the line with one more point; return whether a clock was set.
+
+        The point is the sample with the smallest delay in the last time interval (bucket).
+
+        Args:
+            height: Height of the point above the line: its delay beyond the smallest one, in ns.
+        """
         track = self._track
         rise = track.offset + height - self._fitted_offset
         was_set = rise < -MAX_FALL_NS or (self._rose and rise > MAX_RISE_NS)

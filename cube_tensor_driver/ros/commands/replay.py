@@ -315,10 +315,11 @@ class Player:
         return 0.0
 
     def _find_left_s(self, bag_ns: int) -> float:
-        """Return the time, in s, until a message is due, or until /clock or a request is.
+        """Return the time, in s, to wait before the next call; at most 0 if the message is due.
 
-        While the replay is paused, a message is due only if it belongs to a step (see `step`) or to
-        the time that is shown after a jump (see `SHOWN_NS`).
+        While a replay that is not paused waits, it publishes /clock. In a paused replay, a message
+        is due only if it belongs to a step (see `step`) or to the time that is shown after a jump
+        (see `SHOWN_NS`).
 
         Args:
             bag_ns: Time of recording of the message, in ns since the Unix epoch.

@@ -51,7 +51,8 @@ discards what a subscriber has not yet taken when the publisher ends, so that a 
 that is late by a few milliseconds would miss a single message."""
 
 LAST_VALUES_PERIOD_S = 0.02
-"""Time, in s, between two of the messages of NaN that are repeated for `LAST_VALUES_S`."""
+"""Time, in s, between two of the last messages, which are sent for `LAST_VALUES_S` and set all
+wrenches to NaN."""
 
 
 class SkinWrenches:

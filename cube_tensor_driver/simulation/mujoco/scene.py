@@ -30,9 +30,8 @@ KEPT_S = 2.0
 of a skin need the contacts at slightly different times, and a scene is only computed forwards."""
 
 UNBOUNDED_PERIOD_S = 10.0
-"""Length, in s, of the part of a scene without repetition that is computed in advance and then
-repeated, if the user asks for that (option `--instants`). It is the attribute `period` of such a
-scene."""
+"""Attribute `period`, in s, of the load of a scene that never repeats. With option `--instants`,
+the load of this first part of the scene is computed in advance and played again and again."""
 
 
 def read_scene(path: Path) -> MjModel:

@@ -351,11 +351,11 @@ class HertzFit:
         self._move_contacts(change[:n_parameters].reshape(-1, _N_PARAMETERS))
 
     def _move_contacts(self, change: Array) -> None:
-        """Change the contacts from those at which the response is linearised.
+        """Set the contacts to those at which the response was linearised plus a Gauss-Newton step.
 
         Args:
-            change: Changes (J, 8) of the 8 parameters of each contact. Shifts and changes of radii
-                are limited to `_MAX_STEP`.
+            change: Step (J, 8) of the 8 parameters of each contact. The steps of centre and radius
+                are limited to `_MAX_STEP` in place.
         """
         base = self.linear.contacts
         lengths = np.array([self._depth, self._depth, 1.0])

@@ -184,8 +184,8 @@ class TrackedRegion:
         gap: Distance from the nearest other region in m.
         response: Response (cubes, C), in Pa, of all cubes of the skin to this region.
         home: Index of the cube in the middle of the region, around which the skin is laid flat.
-        integral: Contact of the region as an integral of the traction field, in the frame of `home`
-            in the scan in which it was computed.
+        integral: Estimate of the contact from integrals of the traction field, used until there is
+            a fit; in the frame of the cube that was `home` when it was computed.
         waited: Number of scans (sets of values of all cubes) since the fit was last improved.
     """
 
