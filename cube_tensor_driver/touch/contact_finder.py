@@ -52,8 +52,11 @@ distances, the pressures were lower.
 
 CERTAIN_DEVIATIONS = 2.5
 """Smallest pressure of a new contact, divided by the standard deviation of the pressure that errors
-of the compensation cause. In the two cases that `UNCERTAIN_PRESSURE` describes (warming ground,
-without and with a tare before), the ratio was at most 1.0 and 2.0 at unloaded cubes."""
+of the compensation cause.
+
+At the unloaded cubes that `UNCERTAIN_PRESSURE` describes (warming ground, without and with a tare
+before), the ratio was at most 2.0.
+"""
 
 
 @dataclass(frozen=True)
