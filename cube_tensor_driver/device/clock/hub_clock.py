@@ -3,10 +3,12 @@
 """Conversion of one hub's device times to host times (stamps).
 
 Host time is a straight line over device time (`line.py`). Both are counted from the first sample,
-because a float would round absolute times to 256 ns. A hub takes one sample in each period and
-numbers it, so a device time that deviates from this may be a step of the hub's clock. Then the
-origin of device times moves with it, once the delays of the next samples show that the hub did not
-just sample late. While a clock stands still or keeps stepping, stamps are arrivals.
+because a float would round absolute times to 256 ns.
+
+A hub takes one sample in each period and numbers the samples. If a device time does not agree with
+number and period, the hub's clock was set or the hub sampled late; the delays of the next samples
+show which. After a step of the clock, the origin of device times is moved by the step, so that the
+line stays valid. While a clock stands still or keeps stepping, arrival times are used as stamps.
 """
 
 from __future__ import annotations
@@ -20,23 +22,27 @@ from ..track import MAX_DEVICE_US, NEVER, LinkTrack
 from .line import MAX_DELAY_NS, ClockLine
 
 MAX_PAUSE_NS = 60_000_000_000
-"""Longest pause, in ns, by both clocks, over which the line is continued. After a longer one, the
-error of the drift, up to 6 ms per minute, would look like a step."""
+"""Longest pause between samples, in ns, after which the line is continued. If the pause is longer
+by both clocks, a new line is begun, because the error of the drift, up to 6 ms per minute, would
+look like a step."""
 MIN_STEP_US = 4000.0
-"""Smallest difference, in µs, between the device time that has elapsed since an earlier sample and
-the sample periods in between, at which a step of the hub's clock is suspected. Steps of 5 ms shall
-be found; 1 ms is left for the jitter of the hub."""
+"""Smallest deviation, in µs, of the device time between two samples from a whole number of sample
+periods, at which a step of the hub's clock is suspected. Steps of 5 ms shall be found; 1 ms is left
+for the jitter of the hub."""
 PERIOD_SAMPLES = 64
 """Time constant, in samples, of the low-pass filter that estimates the sample period."""
 DECISION_NS = 200_000_000
-"""Time, in ns, after a suspected step for which delays are collected to decide about it."""
+"""Longest time, in ns, for which delays are collected after a suspected step of the hub's clock, to
+decide whether the clock was set or the hub sampled late."""
 MIN_DECISION_READS = 8
-"""Number of reads after a suspected step that are needed: the delays of fewer may all be long."""
+"""Number of reads of the link after a suspected step before `DECISION_NS` applies. The delays of
+fewer reads may all be long."""
 UNLIKELY_DELAY = 16.0
-"""Ratio of a step to the mean delay above which one delay decides: hardly any delay exceeds the
-mean by half of this factor."""
+"""Ratio of a suspected step to the mean delay above which one delay suffices to decide about the
+step. The delay is compared with half of the step, and hardly any delay is 8 times the mean."""
 MAX_STEPS = 3
-"""Number of steps within `STEPS_NS` from which on a hub's clock is not used."""
+"""Number of steps within `STEPS_NS` at which a hub's clock is not used any more, and arrival times
+are used as stamps."""
 STEPS_NS = 10_000_000_000
 """Length, in ns, of the time window in which steps are counted."""
 MAX_BAD_ANSWERS = 3
@@ -75,7 +81,7 @@ class HubClock:
         self.line = ClockLine(self.track)
         self._step_us = 0  # suspected step of the hub's clock; 0 if none is
         self._steps_ns: deque[int] = deque(maxlen=MAX_STEPS)  # arrivals after the newest steps
-        self._doubtful_stamp = NEVER  # last stamp before a step was certain, maybe too late by it
+        self._doubtful_stamp = NEVER  # last stamp before a step was confirmed; may be too late
         self._restart()
 
     @property
@@ -108,9 +114,9 @@ class HubClock:
         self.track.last_stamp_ns += step_ns
 
     def add_answer(self, sent_ns: int, device_us: int, arrival_ns: int) -> None:
-        """Bound the offset by one question for the hub's time and its answer.
+        """Bound the offset (host time minus device time) by a question to the hub and its answer.
 
-        Without samples, or while stamps are in doubt, the answer is not used.
+        Before the first sample, and while stamps are in doubt, the answer is not used.
 
         Args:
             sent_ns: Host time at which the hub was asked.
@@ -153,13 +159,13 @@ class HubClock:
         start = 0
         for k, number in enumerate(numbers):
             step_us = self._find_step(number, times[k])
-            # While the hub's clock stands still, samples do not become the reference.
+            # While the hub's clock stands still, `_find_step` keeps an earlier reference sample.
             self._is_still = step_us != 0 and self.track.reference != number
             if step_us and not self._is_still:
-                # Samples before a step are converted without it.
+                # Samples before the step are converted as if there were none.
                 stamps += self._convert(times[start:k], arrival_ns, is_late)
                 start = k
-                # If an earlier step is undecided, the sum of both is decided.
+                # If an earlier step is undecided, one decision is made about the sum of the two.
                 step_us += self._step_us
                 self._step_us = step_us if abs(step_us) > MIN_STEP_US else 0
                 self._min_height = math.inf
@@ -181,7 +187,11 @@ class HubClock:
         self._steps_ns.append(self.track.last_arrival_ns)
 
     def _find_step(self, number: int, device_us: int) -> int:
-        """Return the deviation of a device time, in µs, if it may be a step; else 0."""
+        """Compare a device time with the reference, an earlier sample, and the sample period.
+
+        Returns:
+            Deviation of the device time, in µs, if it may be a step of the hub's clock; else 0.
+        """
         track = self.track
         interval = device_us - track.reference_us
         n_periods = (number - track.reference) % COUNTER_RANGE
@@ -195,7 +205,7 @@ class HubClock:
             if period <= 0.0:
                 track.period_us = max(0.0, interval / n_periods)
             elif not is_step:
-                # The change is limited, or a clock that stands still would shorten the period.
+                # Without the limit, a clock that stands still would shorten the period.
                 bound = period / PERIOD_SAMPLES
                 track.period_us += min(max(error, -bound), bound) / PERIOD_SAMPLES
         # While the clock stands still, the reference is kept, so that the deviation grows.
@@ -205,12 +215,19 @@ class HubClock:
         return round(error) if is_step else 0
 
     def _decide(self, height: float, arrival_ns: int) -> None:
-        """Decide whether the clock was set or the hub sampled late, if heights show it by now."""
+        """Decide whether the clock was set or the hub sampled late, if the delays show it by now.
+
+        Args:
+            height: Delay of the newest sample beyond the smallest one, in ns, if the hub's clock
+                was not set (`ClockLine.height`).
+            arrival_ns: Host time at which the sample arrived.
+        """
         self._n_reads += 1
         self._min_height = min(self._min_height, height)
         step_ns = 1000 * self._step_us
-        # The smallest height is 0 if the hub sampled late, and -step_ns if its clock was set.
-        # Below the middle only the lower of the two is possible.
+        # With the smallest delay, the height is 0 if the hub sampled late, and -step_ns if its
+        # clock was set. Longer delays raise it, so a height below the middle of these two values
+        # proves the lower one.
         is_low = self._min_height < -step_ns / 2
         is_long = abs(step_ns) > UNLIKELY_DELAY * self.track.jitter_ns
         is_old = arrival_ns - self._since_ns >= DECISION_NS and self._n_reads >= MIN_DECISION_READS
@@ -227,13 +244,19 @@ class HubClock:
         self._count_step(CLOCK_SET)
 
     def _learn(self, newest_us: int, arrival_ns: int, is_late: bool) -> bool:
-        """Fit the line to the newest of some samples, and return whether it can be used."""
+        """Fit the line to the newest of some samples, and return whether the line can be used.
+
+        Args:
+            newest_us: Largest device time of the samples, in µs.
+            arrival_ns: Host time at which the samples arrived.
+            is_late: Whether this host is too slow and reads the samples late.
+        """
         track = self.track
         pause_ns = arrival_ns - track.last_arrival_ns
         device_pause_ns = 1000 * (newest_us - track.first_us) - track.newest_ns
         track.last_arrival_ns = arrival_ns
         if pause_ns < 0:
-            # The step of the host's clock was missed, or a simulated time was restarted.
+            # The host's clock was set back without being noticed, or simulated time was restarted.
             track.last_stamp_ns = NEVER
             self.reset()
         elif min(pause_ns, device_pause_ns) > MAX_PAUSE_NS and track.newest_ns != NEVER:
@@ -251,7 +274,7 @@ class HubClock:
         arrival = arrival_ns - track.first_ns
         if self._step_us:
             self._decide(self.line.height(1000 * (newest_us - track.first_us), arrival), arrival_ns)
-        # Without a device time, or while a step is undecided, delays are unknown.
+        # While the hub's clock stands still, or a step is undecided, delays are unknown.
         if not self._is_still and not self._step_us:
             device_ns = 1000 * (newest_us - track.first_us)
             if self.line.add(device_ns, arrival, is_late):

@@ -32,18 +32,22 @@ MIN_BUCKETS_FOR_DRIFT = 5
 """Smallest number of points, one for each bucket of 1 s, from which the drift of the hub's clock is
 estimated. Within fewer seconds, a change of the delay would look like drift."""
 UNKNOWN_DRIFT = 1e-4
-"""Largest assumed error of a drift from one point: quartz crystals deviate by less than 100 ppm.
-With n points it is n times smaller."""
+"""Largest assumed error of the drift (relative deviation of the clocks' rates) if the line has at
+most one point: quartz crystals deviate by less than 100 ppm. With n points, the assumed error is n
+times smaller."""
 MAX_DRIFT = 1e-3
-"""Largest credible drift. A larger one arises when the host pauses and reads many samples late."""
+"""Largest credible drift, to which the fitted drift is limited. A larger one is found when the host
+pauses and reads many samples late."""
 MAX_RISE_NS = 20e6
-"""Largest credible rise of the smallest delay, in ns; USB adapters delay samples by up to 16 ms.
-If two buckets in a row show a larger one, a clock was set; a single one may come from a pause."""
+"""Largest credible rise, in ns, of a bucket's smallest delay above the fitted line; USB adapters
+delay samples by up to 16 ms. If the rises of two successive buckets are larger, a clock was set; a
+single larger one may come from a pause of the host."""
 MAX_FALL_NS = 4e6
-"""Largest credible fall of the smallest delay between two buckets, in ns. If it is larger, a clock
-was set. Steps of 5 ms shall be found."""
+"""Largest credible fall, in ns, of a bucket's smallest delay below the fitted line. After a larger
+fall, a clock was set. Steps of 5 ms shall be found."""
 MAX_DELAY_NS = 60_000_000_000
-"""Longest credible delay between sampling and arrival, in ns."""
+"""Longest credible delay between sampling and arrival, in ns. If the line gives a longer one, the
+arrival time is used as the stamp."""
 JITTER_POINTS = 64
 """Time constant, in reads of the link, of the low-pass filter that estimates the jitter: the mean
 height of the points above the line, which is their mean delay beyond the smallest."""
@@ -52,8 +56,9 @@ height of the points above the line, which is their mean delay beyond the smalle
 class ClockLine:
     """Straight line below the points (device time, arrival) of the samples of one hub.
 
-    The track has its coefficients: `drift`, `offset` with the smallest delay, and `bounded_offset`
-    without it, as far as it is known. All times are in ns since the first point.
+    Its coefficients are attributes of the track: `drift`; `offset`, which includes the smallest
+    delay; and `bounded_offset`, which excludes that delay as far as round trips tell it. All times
+    are in ns since the first point.
 
     Attributes:
         error_bound: Largest possible error of `bounded_offset`, in ns; None without round trips.
@@ -71,7 +76,7 @@ class ClockLine:
         self._track.bucket_height = math.inf
         self._points.clear()
         self._fitted_offset = math.nan  # `offset` after the last fit; NaN before
-        self._rose = False  # whether the last bucket was above `MAX_RISE_NS`
+        self._rose = False  # whether the last bucket's rise was above `MAX_RISE_NS`
         self.forget_round_trips()
 
     def forget_round_trips(self) -> None:
@@ -123,13 +128,14 @@ class ClockLine:
             arrival_ns: Host time of the answer.
 
         Returns:
-            Whether the answer agrees with the samples and earlier ones; else it is not used.
+            Whether the answer agrees with the samples and earlier answers; else it is not used.
         """
         drift = self._track.drift
         elapsed = device_ns - self._answered_ns
         tolerance = abs(elapsed) * UNKNOWN_DRIFT / max(1, len(self._points))
         line = self._track.offset + drift * device_ns
-        # Earlier bounds follow the drift, and move apart by its error.
+        # The bounds from earlier answers are extrapolated with the drift to the device time of
+        # this answer, and widened by the possible error of the drift.
         drifted = drift * elapsed
         low = max(sent_ns - device_ns, self._low + drifted - tolerance, line - MAX_DELAY_NS)
         high = min(arrival_ns - device_ns, self._high + drifted + tolerance, line + MAX_FALL_NS)
@@ -172,7 +178,8 @@ class ClockLine:
         return was_set
 
     def _set_bounded_offset(self) -> None:
-        """Set `bounded_offset` to the centre of the bounds, but so that no delay is negative."""
+        """Set `bounded_offset` to the centre of the bounds, but at most to `offset`, so that no
+        delay is negative."""
         track = self._track
         centre = math.inf
         if self.error_bound is not None:
