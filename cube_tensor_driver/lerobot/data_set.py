@@ -45,7 +45,8 @@ RESIDUAL = f"{TACTILE}.residual"
 explains, divided by their noise."""
 
 AXES = ("sample", "cube", "component")
-"""Names of the axes of the features of the stress."""
+"""Names of the axes of a feature of the stress in one frame: sample in the frame, cube, and
+component of stress or gradient."""
 
 IMAGE_AXES = ("height", "width", "channels")
 """Names of the axes of an image."""
@@ -58,7 +59,8 @@ _IMAGE = pyarrow.struct([("bytes", pyarrow.binary()), ("path", pyarrow.string())
 """Parquet type of an image as LeRobot stores it: the bytes of the image file, or its path."""
 
 Columns = Mapping[str, AnyArray | list[bytes]]
-"""Values of features in n frames: arrays (n, …), or n image files each."""
+"""Values in n frames by the name of the feature: an array (n, …), or the contents of n image
+files."""
 
 
 class DataSet:
@@ -67,9 +69,9 @@ class DataSet:
     It is written episode after episode (an episode is one execution of a task).
 
     Attributes:
-        calibrations: One entry for the first calibrations, and one for each change: the ids of the
-            cubes' calibrations, and bag and stamp (ns since the Unix epoch) from which on they were
-            used.
+        calibrations: One entry for the first calibrations, and one for each change. An entry has
+            the ids of the cubes' calibrations, and the bag and the stamp (ns since the Unix epoch)
+            from which on they were used.
     """
 
     def __init__(
@@ -103,8 +105,8 @@ class DataSet:
         self._file_number = 0
         self._frames = self._first_frame = 0
         self._random = np.random.default_rng(0)
-        # The values of every feature are described in as many parts. The statistics of an episode
-        # are those of the parts from `_first_part` on.
+        # Each call of `write` appends one part (statistics of its frames) to every feature's list.
+        # The parts from index `_first_part` on belong to the current episode.
         self._parts: dict[str, list[Part]] = defaultdict(list)
         self._first_part = 0
 
@@ -112,7 +114,8 @@ class DataSet:
         """Write successive frames of an episode as one group of rows of the current Parquet file.
 
         Args:
-            columns: Values of all features except the counters, by the names of the features.
+            columns: Values of the features by their names, without time and indices (of frame,
+                episode and task), which are added here.
             task: Text of the episode's task.
         """
         index = self._frames + np.arange(len(columns[TACTILE]))
@@ -144,7 +147,8 @@ class DataSet:
 
         for key, values in columns.items():
             if isinstance(values, list):
-                # A few pixels of one image suffice. Decoding every image would be slow.
+                # A few pixels of one image suffice for the statistics of colours. Decoding every
+                # image would be slow.
                 pixels: AnyArray = decode(values[0])
                 shape = pixels.shape
                 names: Sequence[str] | None = IMAGE_AXES

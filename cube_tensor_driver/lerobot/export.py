@@ -36,7 +36,7 @@ class Exported:
         frames: Number of exported frames (time steps).
         rows: Number of exported samples of cubes.
         depth: Number of samples of each cube that a frame has room for.
-        usual: Number of samples of each cube in most frames.
+        usual: Median number of samples of a cube in the frames of a bag; the largest of all bags.
         features: Names of the features (columns) that come from topics other than stress.
         left_out: Numbers of samples and episodes that were not exported, by a text with the reason.
     """
@@ -67,7 +67,8 @@ def export_lerobot(
         report: Function that displays progress.
 
     Raises:
-        BagError: A bag is damaged, the choices do not fit, or the folder cannot be written.
+        BagError: A bag is damaged, the choices do not fit the bags, or the folder is not empty or
+            cannot be written.
     """
     # The folder is checked before the bags are read, because reading them takes long.
     check_empty(folder)

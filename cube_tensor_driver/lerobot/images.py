@@ -69,7 +69,7 @@ class ImageStream:
     def at(self, ends_ns: Iterable[int]) -> list[bytes]:
         """Return the file of the newest image that is stamped before the end of each frame.
 
-        Before the first image, it is a black one.
+        For frames that end before the first image, it is the file of a black image.
 
         Args:
             ends_ns: Ends of frames, in ns since the Unix epoch; no call may go back in time.

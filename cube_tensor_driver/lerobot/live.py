@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Touch recorded live beside a LeRobot data set, whose frames refer to it by a number in a picture.
+"""Recording of live touch beside a LeRobot data set, whose pictures contain the numbers to find it.
 
 `lerobot-record` 0.4.4 takes from a camera only a picture of 8 bits per colour, and from a robot
 only 32-bit numbers that it joins to one vector (function `build_dataset_frame` in the file

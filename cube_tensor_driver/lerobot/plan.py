@@ -100,7 +100,7 @@ class Episode(NamedTuple):
     frames: range
 
     def blocks(self, length: int) -> list[range]:
-        """Divide the frames into blocks of a length; the last one may be shorter."""
+        """Divide the frames into blocks of `length` frames; the last block may be shorter."""
         return [
             self.frames[k : k + length]
             for k in range(
@@ -224,7 +224,10 @@ def plan_bag(path: Path, choices: Choices) -> BagPlan:
 
 
 def _read_samples(source: BagSource) -> Iterator[tuple[Times, Index]]:
-    """Yield stamps and cube indices of all samples; the index of unknown cubes is their number."""
+    """Yield the stamps and cube indices of all samples.
+
+    The index of cubes that the skin does not have is replaced by the number of cubes in the skin.
+    """
     n_cubes = len(source.skin.cubes)
     for stamp_ns, cube in source.bag.columns(
         source.topic,
@@ -235,7 +238,7 @@ def _read_samples(source: BagSource) -> Iterator[tuple[Times, Index]]:
 
 
 def _check_rate(plan: BagPlan, seconds: float, fps: int) -> None:
-    """Check that every frame can have a sample, and that no frame has far more than usual.
+    """Check that every frame can have a sample, and that no frame has far too many samples.
 
     Args:
         plan: Episodes and frames of the bag.
@@ -283,8 +286,8 @@ def _read_marks(bag: Bag, topic: str) -> tuple[Times, list[str]]:
         topic: Topic of the marks.
 
     Returns:
-        Time (M,) of recording of each mark, in ns since the Unix epoch. Text before the first mark,
-        which is empty, and of each mark.
+        Time (M,) of recording of each mark, in ns since the Unix epoch. M + 1 texts: an empty one
+        for the time before the first mark, and the text of each mark.
 
     Raises:
         BagError: The topic does not exist, or none of its marks has a text.

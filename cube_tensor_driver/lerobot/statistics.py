@@ -62,7 +62,7 @@ def summarise(parts: Sequence[Part], frames: int) -> dict[str, list[object]]:
     unchanged on normalisation.
 
     Args:
-        parts: Parts of the rows.
+        parts: Results of `describe`, which together cover all rows.
         frames: Number of frames, which LeRobot uses as the weight of the statistics when it merges
             data sets.
 

@@ -34,7 +34,7 @@ JOINT_STATE_TYPE = "sensor_msgs/msg/JointState"
 """Message type of joint states: names, positions, velocities and efforts of a robot's joints."""
 
 HEADER_KIND = (Nodetype.NAME, "std_msgs/msg/Header")
-"""Kind of the field with the header, which contains the stamp of a message."""
+"""Type, as the library rosbags describes it, of the field with a message's header and stamp."""
 
 JOINT_FIELDS = ("position", "velocity", "effort")
 """Fields of a JointState message that have one number per joint."""
@@ -158,7 +158,7 @@ def find_topics(paths: Sequence[Path], choices: Choices) -> list[Topic]:
             frequencies = choices.frequencies or f"{bag.skin_prefix()}frequencies"
             cubes = frequencies.removesuffix("frequencies") + "cubes/"
             for one in sorted(bag.connections, key=attrgetter("topic")):
-                # The stress of the skin contains the same numbers as the topics of single cubes.
+                # Topics of single cubes are left out: the stress of the skin has their numbers.
                 name, msgtype = one.topic, one.msgtype
                 if not one.msgcount or name.startswith(cubes) or not _is_usable(msgtype):
                     continue
@@ -240,7 +240,8 @@ def _nested_paths(fields: Fielddefs, prefix: str) -> Iterator[str | None]:
     """Yield the paths of the numbers in some fields, including those in nested messages.
 
     Args:
-        fields: Name and kind of each field, as `message_fields` returns them.
+        fields: Name and kind (type, as the library rosbags describes it) of each field, as
+            `message_fields` returns them.
         prefix: Path from the outermost message to these fields, ending in "."; "" if they are the
             fields of the outermost message itself.
 

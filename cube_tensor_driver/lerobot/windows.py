@@ -36,7 +36,7 @@ def stream_windows(
 
     Args:
         parts: Frame number (N,) of N rows, and the rows.
-        blocks: Successive frames each, in rising order. Rows of other frames are left out.
+        blocks: Ranges of frame numbers, in rising order. Rows of other frames are left out.
         counts: (frames, cubes) number of rows of each cube in each frame.
         depth: Number of samples of each cube that a window has room for.
 
