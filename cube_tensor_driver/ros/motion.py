@@ -150,7 +150,7 @@ class GravityMotion:
         self._transforms = Transforms(node)
 
     def motion(self, first_ns: int, last_ns: int) -> Motion:
-        """Return the motion that follows from the newest transform, at the end of a span of time.
+        """Return the motion at the end of a span of time, computed from the newest transform of TF.
 
         Arguments and errors are those of `ImuMotion.motion`.
         """
@@ -169,7 +169,7 @@ class GravityMotion:
 
 
 IMU_HEADER = struct.Struct("<4xiII")
-"""Layout of the begin of a serialised message sensor_msgs/Imu (little-endian CDR): seconds and
+"""Layout of the beginning of a serialised message sensor_msgs/Imu (little-endian CDR): seconds and
 nanoseconds of the stamp, and length of the frame id. The frame id follows."""
 
 IMU_NUMBERS = struct.Struct("<104x3d72x4d")
@@ -178,8 +178,8 @@ velocity, linear acceleration, and the first element of the covariance of the li
 Orientation and other covariances are skipped."""
 
 Vector = tuple[float, ...]
-"""Few numbers, such as the components x, y and z of a vector. Computing with floats is faster than
-with a short array."""
+"""A few numbers, such as the components x, y and z of a vector. Computing with a tuple of floats is
+faster than with a short numpy array."""
 
 UNKNOWN: Vector = (math.nan,) * 3
 """Vector that is not known."""
@@ -322,10 +322,12 @@ class ImuMotion:
         return Motion(time_ns, in_parent.reshape(-1, 4, 3))
 
     def _find_mounting(self, now_ns: int) -> Array:
-        """Return the matrix (12, 12) that the motion of a sample is multiplied by from the right.
+        """Return the matrix (12, 12) that transforms motions from the IMU to the parent frame.
 
-        The product is the motion in the parent frame, of which G' = R G R^T and s' = R s - G' p,
-        with the rotation R and the position p of the IMU.
+        A motion is a row of 12 numbers: the specific force s and its gradient G. It is multiplied
+        by the matrix from the right. In the parent frame the gradient is G' = R G R^T, and the
+        specific force at its origin is s' = R s - G' p, with the rotation R and the position p of
+        the IMU.
         """
         frame, read_ns = self._mounted
         if frame != self._imu_frame or abs(now_ns - read_ns) > MOUNTING_PERIOD_NS:
@@ -342,7 +344,9 @@ class ImuMotion:
 
 
 def _decode(data: bytes) -> tuple[int, Vector, Vector, str]:
-    """Decode a serialised message sensor_msgs/Imu; rclpy takes ten times as long for all of it.
+    """Decode the needed fields of a serialised message sensor_msgs/Imu.
+
+    rclpy decodes all fields, which takes ten times as long.
 
     Returns:
         Time stamp, in ns; specific force, NaN if the IMU does not measure it; angular velocity; and

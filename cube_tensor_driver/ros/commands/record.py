@@ -109,12 +109,13 @@ class Recorder:
         self._unconnected: dict[str, Subscription] = {}
         self._latched: set[str] = set()
         self._connected_s = self._begin_s = 0.0
-        # Messages that the writing thread is to write, and those that are dropped if recording
-        # begins after them: topic, time of arrival in ns, and bytes.
+        # Each message is stored as its topic, time of arrival in ns, and bytes. `_waiting` holds
+        # the messages that the writing thread is to write. `_early` holds messages that came before
+        # recording began; they are dropped when it begins.
         self._waiting: deque[tuple[str, int, bytes]] = deque()
         self._early: list[tuple[str, int, bytes]] = []
-        # The receiving thread changes only the first of these counts and the writing thread only
-        # the second, so they need no lock.
+        # Only the receiving thread changes the number of received bytes, and only the writing
+        # thread that of written bytes, so they need no lock.
         self._received_bytes = self._written_bytes = 0
         self._lock = threading.Lock()
         self._closing = threading.Event()
@@ -161,9 +162,9 @@ class Recorder:
             self._begin(now)
 
     def _begin(self, now: float) -> None:
-        """Drop the messages that came before all topics were connected, and write from now on.
+        """Drop the messages that have come so far, and write those that come from now on.
 
-        Messages of latched topics, which come only once, are kept.
+        Messages of latched topics come only once, so they are kept.
 
         Args:
             now: Time of the monotonic clock, in seconds.

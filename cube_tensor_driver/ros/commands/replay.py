@@ -38,9 +38,9 @@ before every replayed message."""
 SETTLE_S = 1.0
 """Time, in seconds, for which no further subscriber must have come before the replay begins.
 
-It applies if the topic `frequencies` has a subscriber; otherwise `MAX_WAIT_S` does. A node
-discovers each topic separately, so a node that has subscribed to `info` may not have found
-`frequencies` yet and would miss its first messages.
+It applies if the topic `frequencies` has a subscriber; otherwise `MAX_WAIT_S` applies. A node
+discovers each of its topics separately, so when its first subscription appears, it may not have
+found its other topics yet and would miss their first messages.
 """
 
 MAX_WAIT_S = 3.0
@@ -60,8 +60,8 @@ the new position.
 """
 
 MAX_STEP_S = 0.05
-"""Maximum time, in seconds, for which messages are published, or the next one is awaited, before
-requests and signals are looked at."""
+"""Maximum time, in seconds, between two checks for requests and signals, while messages are
+published or the next message is awaited."""
 
 STATE_PERIOD_S = 0.1
 """Time, in seconds, between two messages on `~/state`, the state of the player."""
@@ -169,8 +169,9 @@ class Player:
     def has_subscribers(self) -> bool:
         """Return whether the topics have their subscribers, so that the replay can begin.
 
-        That is so if `frequencies` has subscribers and no new one has come for `SETTLE_S`, or if no
-        new one has come for `MAX_WAIT_S`. The method is to be called repeatedly.
+        That is so if `frequencies` has subscribers and the number of subscribers of all topics has
+        not changed for `SETTLE_S`, or if it has not changed for `MAX_WAIT_S`. The method is to be
+        called repeatedly.
         """
         publishers = list(self._publishers.values())
         if self._clock is not None:
@@ -247,9 +248,13 @@ class Player:
         return self._bag.start_ns + round(position * SECOND)
 
     def _go_to(self, start_ns: int) -> None:
-        """Make the first message from a time of recording on, in ns, the next one.
+        """Continue the replay with the first message that was recorded at or after a time.
 
-        Latched messages (such as `info`) from before are still valid then, and are published.
+        Latched messages (such as `info`) that were recorded before this time are still valid, so
+        they are published at once.
+
+        Args:
+            start_ns: The time, in ns since the Unix epoch.
         """
         for entry in self._bag.entries(self._latched, stop_ns=start_ns):
             self._publishers[entry.topic].publish(entry.data)
@@ -261,11 +266,10 @@ class Player:
         self._is_held = False
 
     def _set_time(self, bag_ns: int) -> None:
-        """Set the pair of corresponding times from which the due time of each message is computed.
+        """Let a time of recording correspond to now; later messages become due relative to it.
 
         Args:
-            bag_ns: Time of recording, in ns since the Unix epoch, that corresponds to the present
-                time of the monotonic clock.
+            bag_ns: The time of recording, in ns since the Unix epoch.
         """
         self._anchor_ns = bag_ns
         self._anchor_s = time.monotonic()
@@ -435,8 +439,8 @@ def replay(
         )
         ReplayControl(node, player)
         on_stop_signal(player.end)
-        # `on_step` may raise errors. A timer would not do, because rclpy prints a traceback of each
-        # error in a callback.
+        # `on_step` may raise errors, so it is called here and not by a timer of rclpy, which would
+        # print a traceback of each error.
         spin_until(
             executor,
             player.has_subscribers,

@@ -35,8 +35,9 @@ RETRY_PERIOD_S = 5.0
 then, because a missing or damaged file may have been replaced."""
 
 MAX_ERRORS_AGE_S = 5.0
-"""Age of the newest message of `stress_errors`, in seconds, from which on the errors of the stress
-count as unknown. Usually the messages are half a second apart."""
+"""Maximum age, in seconds, of the newest message of `stress_errors`. If it is older, the errors
+count as unknown, and `ContactFinder.update` gets None for them. Usually a message comes every half
+second."""
 
 
 class Contacts(SkinSubscriberNode):
@@ -130,7 +131,10 @@ class Contacts(SkinSubscriberNode):
         self._errors_s = time.monotonic()
 
     def _find_errors(self, n_cubes: int) -> Array | None:
-        """Return the newest errors of the stress; None if they are not published for this skin."""
+        """Return the newest errors of the stress (`Reconstructor.errors`), (cubes, 15, causes).
+
+        The result is None if they are unknown or too old, or belong to another skin.
+        """
         errors = self._errors
         is_old = time.monotonic() - self._errors_s > MAX_ERRORS_AGE_S
         if errors is None or is_old or errors.shape[:2] != (n_cubes, len(COMPONENTS)):

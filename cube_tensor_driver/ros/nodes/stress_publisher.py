@@ -3,7 +3,8 @@
 """Publishes stress rows (the stress of one cube at one instant each) on several topics.
 
 All rows go to `stress`, forces of all cubes to `forces`, and the rows of single cubes to
-`cubes/<name>/stress` and `cubes/<name>/wrench`. Errors other than noise go to `stress_errors`.
+`cubes/<name>/stress` and `cubes/<name>/wrench`. Estimated errors of the stress that are not caused
+by noise go to `stress_errors`.
 """
 
 from __future__ import annotations
@@ -128,10 +129,10 @@ class StressPublisher:
 
 
 class ErrorPublisher:
-    """Publishes `stress_errors`, errors of the newest stress of all cubes other than noise.
+    """Publishes `stress_errors`: how uncertain the newest stress is for other reasons than noise.
 
-    Its array is that of `Reconstructor.errors`. It is published only while something is compensated
-    or drift is followed, and while it has subscribers.
+    The message contains the result of `Reconstructor.errors` for all cubes. It is published only
+    while something is compensated or drift is tracked, and while the topic has subscribers.
     """
 
     def __init__(self, node: CubeNode, reconstructor: Reconstructor) -> None:
