@@ -262,7 +262,7 @@ def make_chart_properties(history: History, chart: Chart) -> dict[str, object]:
 
 
 def _make_series(labels: Iterable[str]) -> tuple[uplot.Series, ...]:
-    """Return the appearance of the time, which comes first, and of the line with each label."""
+    """Return how uPlot shows each array of data: first the times, then one line for each label."""
     lines = (
         uplot.Series(
             label=label,

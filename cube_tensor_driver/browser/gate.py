@@ -2,15 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The server that browsers reach: it checks each request and passes it on to viser.
 
-A server that listens on this machine only answers a browser of this machine that shows this page.
-Without a check, any page of the internet that is open in a browser here could talk to it: by its
-address, or by a name that leads to this machine (DNS rebinding). A server on other addresses
-answers browsers that were given its token.
+Without checks, any web page that is open in a browser on this machine could control the skin: it
+could send requests to the address of the server, or to a name that leads to this machine (DNS
+rebinding). Therefore requests that a page of another site makes are refused. In addition, a server
+that only this machine can reach accepts no other host names than `LOCAL_HOSTS`, and a server that
+other machines can reach answers only browsers that were given its token.
 
 viser (1.1) has no setting for these checks. So viser listens at a secret address of this machine
 (`make_secret_address`) and at a port that the system chooses, and `Gate` listens at the address of
-the page. A page of the internet would have to try 2^38 pairs of an address and a port to find
-viser. Other users of this machine could look it up; they are trusted.
+the page. A page of another site would have to try 2^38 pairs of an address and a port to find
+viser. Other users of this machine could look up its address and port; they are trusted.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ MISSING_TOKEN = (
 """Text that a browser shows if its request contains neither the token nor the cookie with it."""
 
 MAX_HEAD_S = 10.0
-"""Maximum time, in seconds, from the begin of a connection until its request is complete."""
+"""Maximum time, in seconds, from the beginning of a connection until the head of its request has
+arrived. After this time the connection is closed."""
 
 _CHUNK_BYTES = 1 << 18
 """Maximum number of bytes that are read at once, from the browser or from viser, and passed on."""
@@ -89,11 +91,11 @@ def refusal(
 
 
 class Gate:
-    """Server, in a thread of its own, that passes the requests of some browsers on to another one.
+    """Server, in a thread of its own, that passes accepted requests on to the server behind it.
 
     It refuses a request for which `refusal` returns a reason, or which lacks a required token. The
-    other server must answer only one request per connection, as that of viser does, because only
-    the first one is checked.
+    server behind it must answer only one request per connection, as viser does, because the gate
+    checks only the first request of a connection.
 
     Attributes:
         port: TCP port on which the gate listens.
@@ -225,7 +227,8 @@ async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> N
     with suppress(OSError):
         while data := await reader.read(_CHUNK_BYTES):
             writer.write(data)
-            # A browser that does not read stops viser from sending.
+            # `drain` waits while the receiver does not read. Otherwise the data that wait for a
+            # slow browser would fill the memory.
             await writer.drain()
     writer.close()
 

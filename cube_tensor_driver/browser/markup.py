@@ -207,8 +207,8 @@ def legend(
     Args:
         quantity: The quantity that the colours show.
         top: Value at the upper end of the bar, in SI units.
-        field: Pressure and shear on the surface. Without a standard deviation (`sigma`), a text
-            replaces the legend of this quantity.
+        field: Pressure and shear on the surface. If the quantity is the standard deviation of the
+            pressure and it is unknown (`field.sigma` is None), the text `NO_DEVIATION` is returned.
     """
     if quantity is DEVIATION and field.sigma is None:
         return box(NO_DEVIATION)

@@ -300,7 +300,7 @@ class Scene:
         """Return the properties of all objects for one instant.
 
         Args:
-            scan: The instant.
+            scan: Values of all cubes at the instant that is drawn.
             colouring: The values that are drawn as colours.
             parts: Those of `PARTS` (controls.py) that are drawn.
             chosen: Index of the chosen cube.

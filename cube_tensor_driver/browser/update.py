@@ -99,7 +99,7 @@ def build_update(
 
     Args:
         skin: The skin.
-        scan: The instant.
+        scan: Values of all cubes at the instant that is shown.
         history: Values of all cubes in the last seconds; the newest are those of the scan.
         settings: What the user has chosen.
         before: Upper ends of the automatic ranges in the picture of the scan before, from which

@@ -61,8 +61,8 @@ from .scan import Links, Scan, ScanSynchronizer
 from .update import ShownSkin
 
 ALL_ADDRESSES = ("", "0.0.0.0", "::")
-"""Values of --host with which the server listens on all addresses of this machine (both,
-IPv4, IPv6)."""
+"""Values of --host with which the server listens on all addresses of this machine: those of IPv4
+and IPv6, of IPv4 alone, and of IPv6 alone."""
 
 PICTURE_PERIOD_S = 0.1
 """Period, in seconds, at which picture, numbers and plots of all pages are updated together."""
@@ -121,7 +121,8 @@ class Viewer:
         # of this machine.
         self._token = "" if host in LOCAL_HOSTS else secrets.token_urlsafe(16)
         address = make_secret_address()
-        # viser prints its address, at which browsers are not to reach it.
+        # viser prints its secret address. The text is discarded, because browsers must use the
+        # address of the gate.
         with contextlib.redirect_stdout(io.StringIO()):
             self._server = viser.ViserServer(
                 address,
