@@ -115,7 +115,8 @@ class McapReader:
             McapError: Its summary is damaged, or it has none because the recording was cut off.
         """
         self._stream = path.open("rb")
-        # The checksum is checked first, because it covers every offset and length used below.
+        # The checksum of the summary is checked first, because it covers every offset and length
+        # that is used below.
         try:
             _check_summary(self._stream)
             self._stream.seek(0)
@@ -199,8 +200,9 @@ class McapReader:
             loaded = loaded.select(inside & is_wanted[loaded.channel])
             loaded_offsets = np.full(len(loaded), chunk.chunk_start_offset)
             if pending is not None:
-                # The chunks are sorted by the times of their first messages, so pending messages
-                # that are older than this chunk are delivered: no message that follows is older.
+                # The chunks are sorted by the times of their first messages, so no message of this
+                # chunk or a later one is older than this time. Older pending messages can be
+                # delivered.
                 ready = int(np.searchsorted(pending.time_ns, chunk.message_start_time))
                 yield pending.select(slice(ready))
                 late = pending.select(slice(ready, None))
@@ -226,9 +228,9 @@ class McapReader:
         """
         self._stream.seek(offset + RECORD_HEAD.size)
         _, data = read_chunk(self._stream.read(length - RECORD_HEAD.size))
-        # This loop finds where the records of the chunk begin, because the library mcap takes many
-        # times as long. A rest of the chunk that is shorter than the head of a message record
-        # contains no message, so the search stops before it.
+        # This loop finds where the records of the chunk begin. The library mcap, which could do
+        # that, takes many times as long. No message can begin in the last bytes of the chunk, which
+        # have no room for the head of a message record, so the search ends before them.
         begins = []
         begin = 0
         n_heads = max(0, len(data) - _MESSAGE_HEAD.itemsize + 1)
@@ -370,7 +372,10 @@ class McapWriter:
 
 @contextmanager
 def report_parse_errors() -> Iterator[None]:
-    """Turn the errors that the library mcap lets escape for damaged bytes into a McapError."""
+    """Turn exceptions of the `with` block, in which the library mcap parses bytes, into McapError.
+
+    For damaged bytes the library also raises exceptions that are not a McapError.
+    """
     try:
         yield
     except (
@@ -419,7 +424,11 @@ def read_chunk(content: bytes) -> tuple[Chunk, bytes]:
 
 
 def rosbag2_metadata(file: FileSummary) -> dict[str, str]:
-    """Return the content of the metadata record that rosbag2 reads if metadata.yaml is missing."""
+    """Return the content of the metadata record that rosbag2 reads if metadata.yaml is missing.
+
+    Args:
+        file: Topics, times and numbers of messages of the MCAP file.
+    """
     return {"serialized_metadata": to_yaml(make_bag_information("mcap", [file]))}
 
 
@@ -440,7 +449,11 @@ def summarise(name: str, index: Summary) -> FileSummary:
 
 
 def read_connections(index: Summary) -> dict[int, Connection]:
-    """Return the topics of an MCAP file by their channels (numbers of the topics in the file)."""
+    """Return the topics of an MCAP file by their channels (numbers of the topics in the file).
+
+    Args:
+        index: Summary of the file as the library mcap reads it.
+    """
     counts = index.statistics.channel_message_counts if index.statistics else {}
     found = {}
     # Sorting by channel gives the topics in the order in which the recorder added them.

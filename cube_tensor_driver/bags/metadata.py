@@ -33,7 +33,8 @@ FILE_NAME = "metadata.yaml"
 """Name of the file in a bag's folder that describes the bag."""
 
 METADATA_VERSION = 9
-"""Version of the format in which metadata.yaml is written, as by rosbag2 of ROS 2 Jazzy."""
+"""Version of the format in which this package writes metadata.yaml, as rosbag2 of ROS 2 Jazzy
+does."""
 
 SUFFIXES = {"mcap": ".mcap", "sqlite3": ".db3"}
 """File name suffix of each storage format; the keys are rosbag2's names of the formats."""
@@ -140,8 +141,8 @@ def quality(
 def parse_profiles(text: str, topic: str) -> Sequence[QosProfile]:
     """Return the quality of service profiles that a storage file states for a topic.
 
-    The result is cached, because bags of one robot have the same text for the same topic. A damaged
-    text counts as none, because messages can be read without it.
+    The result is cached, because bags of one robot have the same text for the same topic. It is
+    empty if the text is damaged, because messages can be read without the profiles.
 
     Args:
         text: List of profiles as YAML; "" if the file states none.
@@ -197,7 +198,8 @@ def read_metadata(folder: Path) -> tuple[list[Path], str]:
 
     Returns:
         The files in the order of recording, and the mode of compression (zstd): "file" if rosbag2
-        compressed whole files, "message" if it compressed single messages, else another text.
+        compressed whole files, "message" if it compressed single messages; any other text means
+        that nothing is compressed.
 
     Raises:
         BagError: There is no metadata.yaml in the folder, it is damaged, or it has a newer version
@@ -268,7 +270,7 @@ def make_bag_information(
         storage: Storage format, a key of `SUFFIXES`.
         files: The storage files in the order of recording, at least one.
     """
-    # Files without messages have no times, so they do not count for the span of the bag.
+    # Files without messages have no times, so they do not count for the time span of the bag.
     used = [file for file in files if file.msgcount] or files[:1]
     start_ns = min(file.start_ns for file in used)
     end_ns = max(file.end_ns for file in used)

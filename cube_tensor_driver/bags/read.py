@@ -44,7 +44,7 @@ MAX_DISORDER_NS = SECOND
 """Largest difference of stamps, in ns, by which messages and samples in a bag may be out of order.
 
 The search for a message that belongs to a sample ends when a stamp has been read that is later
-than the stamp of the sample by this difference.
+than the stamp of the sample by this difference. The message then counts as not recorded.
 """
 
 VERSION = 4
@@ -518,9 +518,17 @@ class Bag:
         topic: str,
         codec: MessageCodec[FrequencyRows] | MessageCodec[StressRows],
     ) -> Iterator[tuple[AnyArray, Times]]:
-        """Yield bytes (M, length) and times of recording (M,) of messages of equal shape.
+        """Join successive messages of equal shape (frame id, number of rows) to batches.
 
         Decoding many messages with one call of numpy takes hardly longer than decoding one.
+
+        Args:
+            topic: Topic of the messages.
+            codec: Codec of the message type, which determines the shape of a message.
+
+        Yields:
+            The bytes (M, length) of M serialised messages, and an array (M,) of the times at which
+            they were recorded, in ns since the Unix epoch.
         """
         waiting: list[tuple[AnyArray, Times]] = []
         shape: tuple[int, bytes] = 0, b""
@@ -630,8 +638,7 @@ def _decompress(data: bytes) -> bytes:
 
     Raises:
         zstandard.ZstdError: The message is damaged.
-        MessageError: It has more than
-            `MAX_MESSAGE_BYTES` after decompression.
+        MessageError: It has more than `MAX_MESSAGE_BYTES` after decompression.
     """
     # A stream is read up to the limit. Decompression in one step would allocate whatever size the
     # compressed data states.

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a bag states about compensation: motion of the skin, states of creep and temperature.
 
-A message on the topic `compensation` has the same stamp as the message of frequencies, and the
-message of stress computed from it, to which it belongs.
+A message on the topic `compensation` belongs to the message of frequencies that has the same stamp,
+and to the message of stress that was computed from those frequencies.
 """
 
 from __future__ import annotations
@@ -135,7 +135,10 @@ class CompensationReader:
         return replace(messages, rows=concatenate(parts))
 
     def _read(self) -> Iterator[tuple[int, RecordedCompensation]]:
-        """Yield the stamp (in ns) and content of each message on `compensation`, as recorded."""
+        """Yield the stamp, in ns since the Unix epoch, and the content of each message.
+
+        The messages are those on the topic `compensation`, in the order of recording.
+        """
         topics = {self._topic} if self.is_recorded else set()
         message: SkinCompensation
         for time_ns, message in self._bag.decoded(topics):

@@ -134,7 +134,14 @@ class RecordedHealthReader:
                 self._read_next(end_ns)
 
     def _read_next(self, end_ns: int) -> list[_StressBatch]:
-        """Read one more batch, if rows up to a stamp may be in it, and return all batches."""
+        """Read one more batch of recorded stress if it may contain rows up to a stamp.
+
+        Args:
+            end_ns: The stamp, in ns since the Unix epoch.
+
+        Returns:
+            All batches in memory.
+        """
         if self._newest_ns < end_ns + MAX_DISORDER_NS:
             for batch in self._unread:
                 self._newest_ns = max(self._newest_ns, batch.last_ns)

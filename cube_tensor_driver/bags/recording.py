@@ -194,7 +194,7 @@ def read_settings(info: SkinInfo) -> Settings:
 
     Raises:
         MessageError: The message has no cubes, an invalid calibration, a number of rest frequencies
-            that is not the number of the cube's pads, or one that is not above 0.
+            that is not the number of the cube's pads, or a rest frequency that is not above 0.
     """
     calibrations = read_cube_calibrations(info)
     # A skin without cubes cannot be reconstructed, and the steps below require at least one cube.

@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Repair, in place, of recordings that were cut off (process killed, disk full, power lost).
 
-An MCAP file is a sequence of records. Messages lie in chunk records (blocks of messages), each of
-which is followed by the index of each of its channels (topics). Everything after the last chunk
-with all of its indexes is cut off, and the summary, which readers need, is written again. An SQLite
-file needs no such repair: SQLite itself rolls back a transaction that was not committed.
+An MCAP file is a sequence of records. Messages lie in chunk records (blocks of messages). A chunk
+record is followed by one index record for each channel (topic) of its messages. A repair cuts off
+everything after the last chunk that has all of its index records, and writes the summary, which
+readers need, again. An SQLite file needs no such repair: SQLite itself rolls back a transaction
+that was not committed.
 
 The StreamReader of the library mcap is not used to find the records: it relies on the lengths
 inside a record, so it finds nothing after the first damaged record. Here the start of the next
@@ -82,7 +83,8 @@ class Repaired(NamedTuple):
     Attributes:
         messages: Number of messages that can be read after the repair.
         cut: Number of bytes that were cut off at the ends of the files.
-        damaged: Number of chunks (blocks of messages) that were left out because they are damaged.
+        damaged: Number of records of MCAP files that were left out because they are damaged, for
+            example chunks (blocks of messages).
     """
 
     messages: int
@@ -107,8 +109,8 @@ def repair(path: Path, keep_rest: bool = True) -> Repaired:
     if not path.is_dir():
         check_storage_path(path)
         folder = path.parent
-    # A file beside metadata.yaml belongs to the bag that this describes, and which is described
-    # again below.
+    # A file beside a metadata.yaml is part of a bag. Then all files of the bag are repaired, and
+    # its metadata.yaml is written again.
     is_folder = path.is_dir() or (folder / FILE_NAME).exists()
     if is_folder:
         # Files that metadata.yaml describes as complete are repaired, too, because the disk may
@@ -141,8 +143,8 @@ def repair(path: Path, keep_rest: bool = True) -> Repaired:
 def _find_storage_files(folder: Path) -> list[Path]:
     """Return the storage files of a folder in the order in which they were written.
 
-    Files that metadata.yaml names come first, in its order. The other files, which are all of them
-    if there is no readable metadata.yaml, follow by the number in their names.
+    Files that metadata.yaml names come first, in its order. The other files follow in the order of
+    the numbers in their names. Without a readable metadata.yaml, only these numbers count.
     """
     listed: list[Path] = []
     with suppress(BagError):
@@ -174,7 +176,7 @@ def _repair_file(path: Path, keep_rest: bool) -> tuple[int, int]:
         keep_rest: Whether the bytes that are cut off are saved in another file, see `repair`.
 
     Returns:
-        Number of bytes that were cut off, and number of damaged chunks that were left out.
+        Number of bytes that were cut off, and number of damaged records that were left out.
     """
     with report_damage(path):
         _check_not_recorded(path)
@@ -198,7 +200,7 @@ def _repair_mcap(path: Path, keep_rest: bool) -> tuple[int, int]:
             `REST_SUFFIX`, in the same folder.
 
     Returns:
-        Number of bytes that were cut off, and number of damaged chunks that were left out.
+        Number of bytes that were cut off, and number of damaged records that were left out.
     """
     size = path.stat().st_size
     is_complete = _has_summary(path)
@@ -236,7 +238,8 @@ def _write_summary(path: Path, salvaged: _Salvaged) -> int:
         salvaged: Its complete chunks.
 
     Returns:
-        0 if the summary is written; otherwise the free space, in bytes, that the disk lacks for it.
+        0 if the summary is written. If the disk is full, the space, in bytes, that the summary and
+        metadata.yaml require.
     """
     # The stream is unbuffered. Otherwise bytes of a failed write would stay in the buffer and be
     # written again when the stream is closed.
@@ -245,6 +248,8 @@ def _write_summary(path: Path, salvaged: _Salvaged) -> int:
         stream.seek(salvaged.end)
         summary = _encode_summary(salvaged, path.name)
         needed = len(summary) + METADATA_ROOM
+        # Zeros are written after the summary and cut off again. If the disk has room for them, it
+        # has room for metadata.yaml.
         with suppress(OSError):
             if stream.write(summary + bytes(METADATA_ROOM)) == needed:
                 needed = 0
@@ -256,7 +261,7 @@ def _write_summary(path: Path, salvaged: _Salvaged) -> int:
 def _check_not_recorded(path: Path) -> None:
     """Raise BagError if a process has a storage file open for writing, as a recorder has.
 
-    A repair would cut off what this process writes next.
+    A repair would cut off what that process writes next.
     """
     try:
         import fcntl
@@ -328,8 +333,8 @@ def _salvage(path: Path) -> _Salvaged:
         BagError: The file does not begin with the bytes of an MCAP file.
     """
     salvaged = _Salvaged()
-    # The last chunk that was read, until the index records of all its channels have been read, and
-    # its number of messages of each channel.
+    # `chunk` is the last chunk that was read, and `counts` its number of messages of each channel.
+    # When the index records of all these channels have been read, `chunk` becomes None.
     chunk: ChunkIndex | None = None
     counts: Counter[int] = Counter()
     with path.open("rb") as stream:

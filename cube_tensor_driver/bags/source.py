@@ -28,7 +28,7 @@ class Segment(NamedTuple):
 
     Attributes:
         messages: M messages of frequencies.
-        recorded_ns: (M,) time at which each was recorded, in ns since the Unix epoch.
+        recorded_ns: (M,) time at which each message was recorded, in ns since the Unix epoch.
         number: Index in `Recording.infos` of the SkinInfo message (calibrations and rest
             frequencies) with which these frequencies were reconstructed.
         states: States of creep and temperature, by name, that the reconstruction had before the

@@ -64,7 +64,7 @@ def execute(
     try:
         return database.execute(sql, values)
     except UnicodeDecodeError as error:
-        # sqlite3 cannot decode its own error message if this quotes a damaged text of the file.
+        # sqlite3 cannot decode its own error message if that quotes a damaged text of the file.
         raise sqlite3.DatabaseError(f"a text of the file is damaged ({error})") from None
 
 
@@ -155,8 +155,8 @@ class SqliteReader:
                     " FROM message_definitions WHERE encoding = 'ros2msg'",
                 )
             )
-        # No table states the number of messages per topic, so they are counted here. This is fast
-        # compared with reading them.
+        # No table states the number of messages per topic, so the messages are counted here.
+        # Counting is fast compared with reading them.
         counts = dict(
             execute(
                 self._database,

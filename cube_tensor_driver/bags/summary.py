@@ -21,8 +21,8 @@ DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 """Message type of the diagnostics, which state the condition of each node and cube."""
 
 MIN_GAP_PERIODS = 1.5
-"""Largest time between two successive samples of a cube that does not count as a gap, divided by
-the cube's median sampling period."""
+"""Time between two successive samples of a cube above which it counts as a gap, divided by the
+cube's median sampling period."""
 
 
 @dataclass(frozen=True)

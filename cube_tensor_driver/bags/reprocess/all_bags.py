@@ -146,7 +146,7 @@ def reprocess_all(
 
 
 def workers(wanted: int | None, jobs: int) -> Executor:
-    """Return worker processes, a context manager.
+    """Return an executor with worker processes, which end when its `with` block ends.
 
     Args:
         wanted: Number of processes that the user gave; None: one per core of this machine.

@@ -95,7 +95,8 @@ class ContactWriter:
             CubeError: Contacts cannot be computed on a skin with these cubes.
         """
         if self._geometry == geometry(info):
-            # A tare, or drift that is tracked, changes all values.
+            # The new message states other rest frequencies, found by a tare or by tracking of
+            # drift. The stress changes with them, which must not count as a touch.
             if info is not self._info:
                 self._touch.restart()
             self._info = info
@@ -121,12 +122,13 @@ class ContactWriter:
     ) -> None:
         """Compute touches and contacts from the stress of M messages and write them into the bag.
 
-        They get the recording time of the message from which they were computed.
+        Touches and contacts get the recording time of the message of frequencies from which they
+        were computed.
 
         Args:
             stress: Rows of stress of all M messages, message after message.
             messages: The M messages of frequencies, all with the same number of rows.
-            recorded_ns: (M,) time at which each was recorded, in ns since the Unix epoch.
+            recorded_ns: (M,) time at which each message was recorded, in ns since the Unix epoch.
         """
         rows_per_message = len(stress) // len(messages)
         for number, stamp_ns in enumerate(messages.stamp_ns.tolist()):
@@ -142,7 +144,7 @@ class ContactWriter:
             self._write(stamp_ns, time_ns, newest)
 
     def _is_due(self, stamp_ns: int) -> bool:
-        """Return whether contacts are due: a period after the last due time, or after a jump back.
+        """Return whether contacts are due: one period after the last time, or when time jumps back.
 
         Args:
             stamp_ns: Stamp of the message of frequencies, in ns since the Unix epoch. If the result
@@ -161,8 +163,8 @@ class ContactWriter:
         Between two due times, only the contacts are written, and only when one begins to slip.
 
         Args:
-            stamp_ns: Stamp of the messages, in ns since the Unix epoch.
-            recorded_ns: Time of recording of the messages, in ns since the Unix epoch.
+            stamp_ns: Stamp of the messages that are written, in ns since the Unix epoch.
+            recorded_ns: Time of recording of these messages, in ns since the Unix epoch.
             touches: Touches in the newest scan.
         """
         if self._finder is None:

@@ -91,7 +91,7 @@ class ReprocessJob:
 
 
 class ReprocessResult(NamedTuple):
-    """Size of what one job has reprocessed.
+    """Amount of data that one job has reprocessed.
 
     Attributes:
         messages: Number of messages of stress that were computed.
