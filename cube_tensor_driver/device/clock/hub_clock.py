@@ -26,9 +26,9 @@ MAX_PAUSE_NS = 60_000_000_000
 by both clocks, a new line is begun, because the error of the drift, up to 6 ms per minute, would
 look like a step."""
 MIN_STEP_US = 4000.0
-"""Smallest deviation, in µs, of the device time between two samples from a whole number of sample
-periods, at which a step of the hub's clock is suspected. Steps of 5 ms shall be found; 1 ms is left
-for the jitter of the hub."""
+"""Smallest deviation, in µs, of the device time between two samples from the sample periods between
+their numbers, at which a step of the hub's clock is suspected. Steps of 5 ms shall be found; 1 ms
+is left for the jitter of the hub."""
 PERIOD_SAMPLES = 64
 """Time constant, in samples, of the low-pass filter that estimates the sample period."""
 DECISION_NS = 200_000_000

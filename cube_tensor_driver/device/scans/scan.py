@@ -262,9 +262,9 @@ class ScanBuilder:
         """Return whether a sample of the pending scan belongs to a scan that is already delivered.
 
         Such a late sample is delivered alone. If it waited for the next samples of the other links,
-        its link would stay one sample behind from then on. To find it, the times of the samples
-        delivered last are compared: if that of every missing link is nearer to the sample than that
-        of the sample's own link, the missing links have delivered their samples of the same time.
+        its link would stay one sample behind from then on. A sample is late if the last delivered
+        sample of every missing link is nearer to it in time than the last delivered sample of its
+        own link: then the missing links have already delivered their samples of the same time.
 
         Args:
             missing: Links that deliver but have no sample in the pending scan.
