@@ -47,7 +47,8 @@ _FORCE: JsonSchema = {
     ],
     "description": "a force in N greater than 0, or a list of at least two from 0 up",
 }
-"""Schema of a normal force: constant, or values at equal intervals during the action."""
+"""Schema of a normal force: its largest value, or values at equal intervals during the action. With
+a single value, the force rises from 0 in the first third and falls to 0 in the last third."""
 _SHEAR: JsonSchema = {
     "anyOf": [
         TRIPLE,
@@ -59,7 +60,8 @@ _SHEAR: JsonSchema = {
     ],
     "description": "a force [x, y, z] in N, or a list of at least two",
 }
-"""Schema of a tangential force: constant, or values at equal intervals during the action."""
+"""Schema of a tangential force: its value at the largest normal force, or values at equal intervals
+during the action. A single value means that it is proportional to the normal force."""
 _TIMES = integer(1, MAX_TAPS, f"an integer from 1 to {MAX_TAPS}")
 """Schema of the number of taps of one action."""
 _PATH = list_of(TRIPLE, "positions [x, y, z]", 2)
@@ -135,8 +137,8 @@ class Action:
         end: Time at which it ends, in s from the begin of the script.
         path: Positions of the indenter, (P, 3), in the unit that `Script.relative` states.
         force: Normal force on the skin, (K,), in N.
-        shear: Tangential force on the skin, in N. Either (K, 3), or (1, 3) for the value at the
-            largest normal force; then the tangential force is proportional to the normal force.
+        shear: Tangential force on the skin, in N: (S, 3) values, or (1, 3) for the value at the
+            largest normal force, to which the tangential force is then proportional over time.
     """
 
     kind: str
@@ -262,7 +264,7 @@ def _make_action(kind: str, item: dict[str, Any]) -> Action:
     force = np.array(item["force"], float)
     if kind == "tap":
         peak = float(item["force"])
-        # Each tap rises from 0 to the peak and falls to 0.
+        # In each tap the force rises from 0 to the peak and falls to 0.
         n_taps = item.get("times", 1)
         force = np.array([0.0, *[peak, 0.0] * n_taps])
     elif force.ndim == 0:

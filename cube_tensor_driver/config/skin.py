@@ -67,8 +67,9 @@ _CUBE_ADDRESS: JsonSchema = {
     "dependencies": {"index": ["link"]},
     "description": "either a uid, or a link and an index",
 }
-"""Schema of the keys that state where a cube is: with a uid and an index, they might contradict
-each other when the cube is replaced. With a uid, the link may be left out."""
+"""Schema of the keys by which a cube is found: its uid, or its link and its index on the hub. A uid
+and an index together are refused, because they might contradict each other after the cube is
+replaced. With a uid, the link may be left out."""
 _CUBE = mapping(
     ("name", "pose", "layout", "calibration"),
     {
@@ -262,7 +263,7 @@ def check_skin(path: Path) -> tuple[Skin | None, list[str]]:
     """Read a skin file and report all its mistakes.
 
     Returns:
-        As `check_skin_data`.
+        The skin and an empty list, or None and the mistakes (see `check_skin_data`).
 
     Raises:
         ConfigError: The file cannot be read or is not YAML.
@@ -281,8 +282,8 @@ def check_skin_data(
         folder: The folder in which the file is or will be. Calibrations are named relative to it.
 
     Returns:
-        The skin and an empty list, or None and the mistakes, one line each: all that the schema
-        finds, or else all that concern several keys or files.
+        The skin and an empty list, or None and the mistakes, one line each. If the JSON schema
+        finds mistakes, only these are returned; otherwise those that concern several keys or files.
     """
     mistakes = [line for _, line in _SCHEMA.mistakes(data)]
     if mistakes or not isinstance(data, dict):

@@ -15,7 +15,8 @@ _ROBOT = """\
   </material>
 {cubes}</robot>
 """
-"""URDF of a skin. A robot may carry several skins, whose materials must have different names."""
+"""Template of the URDF of a skin. A robot may carry several skins, whose materials must have
+different names, so they begin with the name of the skin."""
 
 _CUBE = """\
   <link name="{frame}">
@@ -32,7 +33,8 @@ _CUBE = """\
     <child link="{frame}" />
   </joint>
 """
-"""URDF of a cube: a link (rigid body) with a box of its size, and the joint to the parent frame."""
+"""Template of the URDF of a cube: a link (rigid body) with a box of the size of the cube, and the
+joint to the parent frame."""
 
 
 def make_skin_urdf(skin: Skin) -> str:
