@@ -1,6 +1,7 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Encoding and decoding of SkinCompensation: motion of the skin, and states of effects."""
+"""Encoding and decoding of SkinCompensation messages: the motion of a skin, for the compensation of
+its weight, and the states of creep and temperature."""
 
 from __future__ import annotations
 
@@ -33,7 +34,7 @@ def encode_compensation(
     motion: Motion | None,
     states: Mapping[str, Array],
 ) -> bytes:
-    """Return a serialised SkinCompensation: what a recording needs to repeat a compensation.
+    """Return a serialised SkinCompensation, with which reprocessing can repeat the compensation.
 
     Args:
         frame_id: Parent frame of the skin.

@@ -128,7 +128,8 @@ def make_traction_message(
 def decode_contacts(message: SkinContacts) -> list[Contact]:
     """Return the contacts of a SkinContacts message.
 
-    Values that only tracked contacts have are left out, except those for `slips` and `is_coarse`.
+    Values that only tracked contacts have are left out, except those from which the attributes
+    `slips` and `is_coarse` of `Contact` are set.
 
     Raises:
         ValueError: The arrays of the message have different lengths.

@@ -70,7 +70,7 @@ def make_cloud_message(
 
 
 def make_header(make: MakeMessage, stamp_ns: int, frame_id: str) -> object:
-    """Make a header.
+    """Make the header of a message (std_msgs/Header).
 
     Args:
         make: Function that constructs a message from its type's name and its fields.
