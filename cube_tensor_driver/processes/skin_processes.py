@@ -128,8 +128,8 @@ def skin_processes(
         markers: Whether the node `markers` (picture for RViz) runs, too.
         contacts: Whether the node `contacts` (contacts on the skin) runs, too.
         simulated: Options of simulated hubs; None: the hubs are real.
-        parameters: Further ROS parameters of both nodes, such as `rate`. Each node takes those that
-            it has.
+        parameters: Further ROS parameters of the nodes that process frequencies (driver,
+            reconstruction and simulated IMU), such as `rate`. Each node takes those that it has.
     """
     given: dict[str, Value] = {"config": str(config), **parameters}
     # The ports of simulated hubs must exist before the driver opens them.
