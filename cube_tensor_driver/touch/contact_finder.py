@@ -42,7 +42,8 @@ INVERSE = CONTACT_METHODS[2]
 
 UNCERTAIN_PRESSURE = 1200.0
 """Smallest pressure, in Pa at the depth of the cubes' centres, of a new contact above a cube with
-the status bit COMPENSATION, if the errors of the compensation are not stated.
+the status bit COMPENSATION. The bit says that the compensation of weight, creep or temperature is
+uncertain; the limit applies if `ContactFinder.update` is not told how large its errors are.
 
 The compensated values of nine unloaded cubes 24 mm apart gave a pressure of up to 402 Pa when the
 ground warmed by 15 K within a minute. With a tare before, it was up to 860 Pa: the tare removes the
@@ -127,7 +128,8 @@ class ContactFinder(Protocol):
 
     @property
     def touch_id(self) -> Index:
-        """Number of the touch of each of `contacts`; empty if the method is interpolation."""
+        """Number (n,) of the touch (`Touches.id`) to which each of the n `contacts` is linked,
+        `NO_TOUCH` without a touch; empty if the method is interpolation."""
 
     def update(
         self,
@@ -148,9 +150,10 @@ class ContactFinder(Protocol):
             status: Status bits (cubes,) of `values`.
             touches: Touches in the newest scan.
             errors: Errors (cubes, 15, K) of the values other than noise, as from
-                `Reconstructor.errors`. With the method inverse, stated deviations contain them, and
-                a new contact needs a pressure of `CERTAIN_DEVIATIONS`. None: they are not known,
-                and a new contact where COMPENSATION is set needs `UNCERTAIN_PRESSURE`.
+                `Reconstructor.errors`. The method inverse includes them in its stated deviations,
+                and only finds a new contact if its pressure exceeds `CERTAIN_DEVIATIONS` times the
+                deviation that they cause. None: the errors are not known, and a new contact where
+                COMPENSATION is set needs `UNCERTAIN_PRESSURE`.
         """
 
     def follow(self, time_s: float, values: Array) -> bool:

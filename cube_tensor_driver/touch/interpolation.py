@@ -26,8 +26,8 @@ from ..core.poses import CubePoses
 from .nearest_cubes import find_nearest_cubes
 
 NEIGHBOURS = 9
-"""Number of cubes from which the points of a patch are interpolated: the cube in the centre of the
-patch and those nearest to it."""
+"""Number of cubes from whose values a patch (grid of points around a cube) is interpolated: the
+cube in the centre of the patch and those nearest to it."""
 
 RIDGE = 1e-6
 """Noise variance of each value, divided by the prior variance of the values. It is added to the

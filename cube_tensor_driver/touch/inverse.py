@@ -39,8 +39,9 @@ cube. At a pitch of 4 depths, 2 x 2 points were not enough: a ball that pressed 
 cube, between the four points, was not found."""
 
 MIN_ERROR_CHANGE = 0.1
-"""Smallest change of an error of the values other than noise, divided by the largest error, after
-which errors are stated again, because the noise of all cubes is then computed again."""
+"""Smallest change of the errors given to `SurfaceInverse.state_errors`, divided by the largest of
+them, that has an effect. Smaller changes are ignored, because the noise of all cubes must be
+computed again after each change."""
 
 
 class TractionField(NamedTuple):
@@ -99,7 +100,8 @@ class SurfaceInverse:
         variant: Index (cubes,) of each cube's variant (calibration and pads in use) in the
             measurement model.
         near: Indices (cubes, W) of the cubes nearest to each cube, which itself comes first.
-        errors: Errors (cubes, C, K) of the values other than noise, by K independent causes, in Pa.
+        errors: Errors (cubes, C, K) of the values other than noise, in Pa: one standard deviation
+            of the effect of each of K independent causes.
         revision: Number that increases when `leave_out` changes the pads in use, or `state_errors`
             the errors.
     """
@@ -326,8 +328,9 @@ class SurfaceInverse:
             )
 
     def state_errors(self, errors: Array | None) -> None:
-        """Set the errors of the values other than noise. They do not change the traction field.
+        """Set the errors of the values other than noise, such as those of the compensation.
 
+        They increase the stated deviations of the traction field, but do not change the field.
         Errors that differ little from those in use (`MIN_ERROR_CHANGE`) are ignored.
 
         Args:
@@ -346,7 +349,8 @@ class SurfaceInverse:
                 return
         self.errors = scaled
         self.revision += 1
-        # A cause changes the values of all cubes together.
+        # Each cause changes the values of all cubes together, so its effect on the field is that of
+        # all these changes at once. The causes are independent, so their variances add up.
         self._error_variance = np.zeros((len(self.points), 2))
         for column in np.moveaxis(scaled, 2, 0):
             field = self.field_of_scaled(np.where(self._known, column, np.nan))
@@ -354,8 +358,8 @@ class SurfaceInverse:
 
     @property
     def error_deviation(self) -> Array:
-        """Standard deviation (M,) of the pressure at the depth of the cubes, in Pa, by the errors
-        that `state_errors` has set."""
+        """Standard deviation (M,) of the pressure at the depth of the cubes, in Pa, that the errors
+        set by `state_errors` cause."""
         return np.sqrt(self._error_variance[:, 1])
 
     def field(self, values: Array) -> TractionField:

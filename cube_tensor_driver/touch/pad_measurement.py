@@ -61,8 +61,8 @@ _N_DISTANCES = 400
 of the Bessel functions up to the largest distance (half the width of the finite element body)."""
 
 _PADS = "pads"
-"""Name of the matrix to the pads' stresses in the cached file, beside the attributes of
-`Spectra`."""
+"""Name, in the cached file, of the matrix from circular components to the stresses of the pads. The
+other arrays of the file are the attributes of `Spectra`."""
 
 _MATCH_TOLERANCE = 1e-6
 """Largest difference up to which the cube and pads of a calibration count as those of the influence

@@ -252,7 +252,7 @@ class WindowPosteriors:
         Returns:
             Posterior mean (cubes, points x ROWS_PER_POINT) in Pa, at the surface points around each
             cube. Each point has `ROWS_PER_POINT` results: traction along x, y and z, and pressure
-            at the cubes' depth. (cubes, points) if `only_pressure`.
+            at the cubes' depth. If `only_pressure`, only the latter (cubes, points).
         """
         # The values of all cubes of a window are joined to one row, in the order of the columns of
         # the gain matrix G.

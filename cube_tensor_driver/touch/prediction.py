@@ -60,9 +60,10 @@ class MissingValuePrediction:
     The errors of the predictions for different cubes are treated as independent.
 
     Attributes:
-        variance: Variance (cubes, points x 2) in Pa^2 that the missing values add to the pressure
-            on the surface, and to that at the cubes' depth, at each point around each cube. It is
-            given for the scale s = 1 of the prior (posterior.py), and is to be multiplied by s^2.
+        variance: Variance (cubes, points x 2) in Pa^2 that the missing values add to two pressures
+            at each point around each cube: the pressure on the surface, and the one at the cubes'
+            depth. It holds for the scale s = 1 of the prior (posterior.py); for another scale, it
+            is multiplied by s^2.
     """
 
     def __init__(

@@ -3,10 +3,11 @@
 """Stick, slip and friction coefficient of the contacts of a skin.
 
 The contact tracker takes several milliseconds, too long for every scan (set of values of all cubes)
-at 1 kHz. Between its updates, force and position of each contact are followed in every scan. Let J
-be the derivatives of the cubes' values, divided by their noise, by the parameters of a Hertz
-contact (force, position, radius, flatness), and P the prior precision of these parameters. A change
-dy of the values, divided by their noise, then means a change dp of the parameters::
+at 1 kHz. Between its updates, force and position of each contact are computed in every scan from
+the changes of the cubes' values. Let J be the derivatives of the values, divided by their noise, by
+the parameters of a Hertz contact (force, position, radius, flatness), and P the prior precision of
+these parameters. A change dy of the values, divided by their noise, then means a change dp of the
+parameters::
 
     dp = (J' J + P)^-1 J' dy
 
@@ -54,11 +55,13 @@ SLIP = 2
 """State of a contact whose whole area slides over the skin (gross slip)."""
 
 N_CUBES = 16
-"""Number of cubes nearest to a contact from whose values its force and position are followed."""
+"""Number of cubes nearest to a contact from whose values its force and position are computed in
+every scan."""
 
 LAGS = np.array([2, 4, 8, 16, 32, 64])
-"""Durations, in scans, over which the motion of a contact is tested. The short ones find fast slip
-early; the long ones find slow slip, whose motion the noise hides over a short time."""
+"""Durations, in scans (sets of values of all cubes), over which the motion of a contact is
+tested. The short ones find fast slip early; the long ones find slow slip, whose motion the noise
+hides over a short time."""
 
 MIN_DISTANCE_M = 10e-6
 """Smallest motion in m that counts as slip; the noise of the position is 0.3 to 3 um for loads of
@@ -115,22 +118,26 @@ MIN_FORCE_N = 0.05
 state is `UNKNOWN` unless slip is detected."""
 
 FOLLOWED_DEVIATION = 0.02
-"""Relative standard deviation of the ratio of shear and normal force between updates of the contact
-tracker. The ratio then follows from changes of the cubes' values since the last update. Its error
-was 1.6 % (rms) in simulations of 24-pad cubes, for contacts that had moved by up to some
-millimetres since this update."""
+"""Relative standard deviation of the ratio of shear and normal force that is computed between two
+updates of the contact tracker, from changes of the cubes' values since the last one. Its error was
+1.6 % (rms) in simulations of 24-pad cubes, for contacts that had moved by up to some millimetres
+since this update."""
 
 MAX_SHIFT_DEPTHS = 0.2
 """Shift of a contact, divided by the depth of the cubes' centres below the surface, after which the
-derivatives of the cubes' values by the contact's force and position are computed again."""
+derivatives of the cubes' values by the contact's force and position are computed again. The shift
+is counted from where they were computed last. `MIN_SHIFT_DEPTHS` must be exceeded, too."""
 
 MIN_SHIFT_DEPTHS = 0.1
-"""Shift of a contact since the contact tracker has fitted it, divided by the depth, up to which
-these derivatives need not be exact, because only this shift is computed with them."""
+"""Shift of a contact since the last fit of the contact tracker, divided by the depth of the cubes'
+centres, up to which the derivatives of the cubes' values by the contact's force and position need
+not be exact: only this small shift is computed with them. `MAX_SHIFT_DEPTHS` does not apply then.
+"""
 
 MAX_FITTED_SHIFT_DEPTHS = 0.5
-"""Shift of a contact, divided by the depth, after which these derivatives are computed again in any
-case."""
+"""Shift of a contact, divided by the depth of the cubes' centres, after which the derivatives of
+the cubes' values by the contact's force and position are computed again, even if the contact
+tracker has just fitted the contact (`MIN_SHIFT_DEPTHS`)."""
 
 MAX_FORCE_CHANGE = 0.3
 """Change of the force of a contact, divided by the force, after which the derivatives of the cubes'
@@ -138,9 +145,10 @@ values by the contact's force and position are computed again, because the radiu
 changes with the force."""
 
 MAX_JUMP = 0.6
-"""Change of the force of a contact between two scans (sets of values of all cubes), divided by the
-force, above which the motion of the contact is unknown. The motion follows from changes of the
-cubes' values, which are proportional to the force."""
+"""Change of the force of a contact since the derivatives of the cubes' values by its force and
+position were computed, divided by the force, above which the motion of the contact is unknown. As
+they are computed again above `MAX_FORCE_CHANGE`, only sudden changes, as of a body that bounces,
+are so large. A linear extrapolation gives no useful position then."""
 
 MAX_LINEARISATIONS = 2
 """Largest number of contacts per scan (set of values of all cubes) for which the derivatives of the
@@ -152,16 +160,18 @@ changes of the cubes' values are attributed to changes of both contacts."""
 
 
 MAX_NORMAL_CHANGE = 0.05
-"""Largest change of the normal force, divided by the force, during which it counts as constant for
-`Slip.partial`. With a linear correction for it, changes of 2 % did not change the result."""
+"""Largest change of the normal force of a contact during the fit of `Slip.partial`, divided by the
+force; after a larger change, the fit starts again. The fit includes a term for the normal force, so
+that changes of 2 % did not change the result."""
 
 MAX_SHIFT_M = 2e-4
-"""Largest motion of a contact, in m, for which `Slip.partial` is known. Half of it gave values up
-to 0.05 in simulations of flat punches; 1 mm changes the stresses as much as partial slip does."""
+"""Largest motion of a contact, in m, during the fit of `Slip.partial`; after a larger motion, the
+fit starts again. Motion changes the stresses like partial slip, by as much if it is 1 mm. A motion
+of 0.1 mm gave values up to 0.05 in simulations of flat punches, which have no partial slip."""
 
 PARTIAL_DEVIATION = 0.01
-"""Largest standard deviation of `Slip.partial` due to the noise of the pads; it is unknown if its
-deviation is larger, as while the shear force has changed little."""
+"""Largest standard deviation of `Slip.partial` due to the noise of the pads. If it is larger, as it
+is while the shear force has changed little, `Slip.partial` is unknown (NaN)."""
 
 
 class Slip(NamedTuple):
@@ -175,10 +185,10 @@ class Slip(NamedTuple):
             before the first slip.
         velocity: Velocity (n, 3) of slip in m/s, in the skin's parent frame; 0 without slip, NaN if
             the state is unknown.
-        partial: Part (n,) of the change of the cubes' values, since the normal force has been
-            constant, that is not proportional to the change of the shear force, divided by this
-            change; a sign of partial slip. NaN if the normal force changes, the contact moves, or
-            the shear force has changed too little.
+        partial: Measure (n,) of partial slip. It is the ratio |C |q| q| / |B q + C |q| q| (head of
+            this file): of the change of the cubes' values that the shear force causes, the part
+            that is not proportional to the change q of the shear force. NaN if the normal force
+            changes, the contact moves, or the shear force has changed too little.
     """
 
     state: Index
@@ -228,9 +238,11 @@ class SlipEstimator:
         # changes of these values to changes of the load. `linearised` is the load for which this
         # matrix was computed, and `noise` the standard deviation of the position, in m. `sums` are
         # those of `_add_ratio`. `past` has the motion states (`_decide_motion_state`) of the last
-        # scans, newest first. `first` are cubes, weights and values at the begin of the fit of
-        # `Slip.partial`, `terms` are its terms in the newest scan, and `gram` and `moments` the
-        # sums of their products with each other and with the changes of the values.
+        # scans, newest first. The remaining fields belong to the fit of `Slip.partial`, which is
+        # stored in `partial`. `first` are cubes, weights and values in the first scan of the fit,
+        # and `terms` are the terms of the fit in the newest scan. `gram` and `moments` are sums
+        # over all scans of the fit: products of the terms with each other, and of the terms with
+        # the changes of the values.
         linear: list[tuple[str, type, tuple[int, ...]]] = [
             ("cubes", int, (count,)),
             ("weights", float, (6, n_values)),
@@ -298,13 +310,15 @@ class SlipEstimator:
         contacts["load"] = [[*one.force, *one.position] for one in found]
         contacts["values"] = self._gather(scaled)
         after = _decide_motion_state(contacts["load"], normal)
-        # The tracker has fitted the loads again, which corrects errors of the followed ones. The
-        # past states get the same correction, so that it does not look like motion.
+        # The tracker has fitted the loads again. This corrects the errors of the loads that were
+        # computed from changes of the values since its last fit. The past states get the same
+        # correction, so that it does not look like motion.
         correction = after - before
         contacts["past"] += correction[:, None]
 
         # The friction coefficient is a mean of force ratios during slip. When the tracker fits a
-        # contact for the first time while it slips, the ratios that were only followed are dropped.
+        # contact for the first time while it slips, earlier ratios are dropped, because they were
+        # only computed from changes of the values.
         slips = contacts["slips"]
         is_new = slips & ~contacts["is_fitted"]
         contacts["sums"][is_new] = 0.0
@@ -391,7 +405,8 @@ class SlipEstimator:
         A fit starts again when the normal force or the position has changed, or the contact slips.
         """
         contacts = self._contacts
-        # The weights of the first scan are kept, because others would change the shear force, too.
+        # The weights of the first scan of a fit are used throughout, because other weights would
+        # give another shear force even for the same values.
         first = contacts["first"]
         values = scaled[first["cubes"]].reshape(len(contacts), -1)
         change = np.nan_to_num(values - first["values"])
@@ -417,7 +432,8 @@ class SlipEstimator:
         """Return `Slip.partial` (n,)."""
         contacts = self._contacts
         terms, curved = contacts["terms"], contacts["terms"][:, 5:]
-        # Terms along the normal are 0, and all terms at the begin of a fit.
+        # The shear force has no component along the normal, and all sums are 0 at the begin of a
+        # fit. A small addition to the diagonal lets the matrix be inverted nevertheless.
         size = np.trace(contacts["gram"], axis1=1, axis2=2)[:, None, None]
         inverse = np.linalg.inv(contacts["gram"] + 1e-9 * (size + 1) * np.eye(8))
         parts = terms[:, :, None] * (inverse @ contacts["moments"])
@@ -495,7 +511,7 @@ class SlipEstimator:
         self._times[0] = time_s
 
     def _gather(self, scaled: Array) -> Array:
-        """Return the values (n, values) in Pa of the cubes from which each contact is followed."""
+        """Return the values (n, values) in Pa of the `N_CUBES` cubes near each of n contacts."""
         values: Array = scaled[self._contacts["cubes"]]
         return values.reshape(len(self._contacts), -1)
 

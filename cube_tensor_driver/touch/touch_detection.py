@@ -42,8 +42,9 @@ FALSE_ALARMS = 1.0
 """Default rate of touches found in noise alone, per hour, of the whole skin."""
 
 MIN_RATE_HZ = 1000.0
-"""Smallest sampling rate of each cube, in Hz, for which the rate of false alarms holds. At a lower
-rate, they are rarer. A recording, which does not state its rate, therefore gives the same touches.
+"""Smallest sampling rate of each cube, in Hz, for which the limit of the CUSUM is computed. If the
+skin file states a lower rate or none, the limit is that for this rate, and false alarms are rarer
+than chosen. So a recording, which does not state its rate, gives the same touches as the sensor.
 """
 
 TIME_CONSTANT_S = 1.0
@@ -109,7 +110,7 @@ STALE_NS = 1_000_000_000
 longer time, the cube counts as untouched, and its next sample starts the detection again."""
 
 NO_TOUCH = -1
-"""Number in place of the number of a touch where there is no touch."""
+"""Number that stands for "no touch" where otherwise the number of a touch (`Touches.id`) stands."""
 
 ERRORS_PERIOD_NS = 100_000_000
 """Time, in ns, after which the errors that imperfect compensation and drift cause at touched cubes
@@ -491,8 +492,8 @@ class Touch:
     def _update_errors(self, cube: Index, stamp_ns: int) -> Array:
         """Return the errors (m, W, 15, K) of the values of m cubes and their neighbours.
 
-        They have K causes other than noise. They are computed for other cubes than before, or after
-        `ERRORS_PERIOD_NS`.
+        The errors have K independent causes other than noise. They are only computed if the cubes
+        are not those of the last call, or if they are older than `ERRORS_PERIOD_NS`.
 
         Args:
             cube: Indices (m,) of the cubes.

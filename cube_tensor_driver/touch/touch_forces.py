@@ -77,7 +77,9 @@ def estimate_forces(
     near: Index,
     covariance: Array,
 ) -> ForceEstimate:
-    """Compute the matrices of all cubes, which takes half a second and 5 ms for each kind.
+    """Compute the matrices of all cubes.
+
+    This takes half a second, and 5 ms more for each kind of cube (`ForceEstimate`).
 
     Args:
         poses: Poses of the cubes.

@@ -1,6 +1,11 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Finds out which touch (found in every scan) each contact (found less often) belongs to."""
+"""Links contacts to touches.
+
+A touch is detected in every scan (set of values of all cubes), at the cube with the largest
+pressure (touch_detection.py). The contact tracker finds the contacts less often, but with more
+detail (tracker/contact_tracker.py). A link tells which touch a contact belongs to.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +20,13 @@ from .tracker.contact_tracker import TrackedContact
 
 MAX_PITCHES = 2.0
 """Largest distance, in pitches (distances of neighbouring cubes), from the edge of a contact to the
-cube of its touch. The largest pressure of a wide contact may be far from its centre."""
+cube of the touch to which it is linked. The distance is not measured from the centre, because the
+largest pressure of a wide contact may be far from it."""
 
 MIN_CHANGE_PITCHES = 0.5
-"""Smallest difference, in pitches, by which another touch must be nearer to a contact than its
-present one to replace it. A contact between two touches would change between them otherwise."""
+"""Distance, in pitches (distances of neighbouring cubes), by which another touch must be nearer to
+a contact than the touch to which it is linked, before the link changes. Otherwise, the link of a
+contact between two touches could change in every scan (set of values of all cubes)."""
 
 
 class TouchLinks:
