@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of an unloaded skin: means over blocks of time, and low-pass filters of readings."""
+"""Means of a recording over blocks of time, and low-pass filters of values at given times."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .recorded_loads import find_cubes
 
 
 class BlockMeans:
-    """Means of the pads' stresses and of another quantity over blocks of time of a bag.
+    """Means over blocks of time of the pads' stresses and of another quantity in a bag (recording).
 
     Attributes:
         names: Names of all cubes in the bag.
@@ -42,8 +42,9 @@ class BlockMeans:
             path: Path of the bag.
             name: Name of a cube; None: all.
             block_ns: Duration of a block, in ns.
-            quantity: Column of `FrequencyRows`. Rows in which it is unknown are left out.
-            width: Number of values of the quantity in a row.
+            quantity: Name of the column of `FrequencyRows` with the other quantity to average, such
+                as "temperature". Rows in which it is unknown (NaN) are left out.
+            width: Number of values of this quantity in a row.
 
         Raises:
             BagError: The bag has no such cube.
@@ -78,11 +79,11 @@ class BlockMeans:
                 np.add.at(self.counts, place, 1)
 
     def of_cube(self, cube: int) -> tuple[Array, Array, Array]:
-        """Return the means in the n blocks with rows of a cube.
+        """Return the means of one cube, for the n blocks in which it has rows.
 
         Returns:
-            Times of the blocks since the beginning of the bag (n,), in s; stresses of the cube's
-            pads (n, P), in Pa; and the quantity (n, width).
+            Times of the blocks since the beginning of the bag (n,), in s; mean stresses of the
+            cube's pads (n, P), in Pa; and means of the other quantity (n, width).
         """
         number = np.flatnonzero(self.counts[cube])
         seconds = number.astype(float) * self._block_s
@@ -93,11 +94,13 @@ class BlockMeans:
 
 
 def find_lags(seconds: Array, values: Array, time: Array) -> Array:
-    """Return how far K low-pass filters lag behind values (N, K, P); they do not at first.
+    """Return the values minus the outputs of K low-pass filters of these values (N, K, P).
+
+    At the first time, each output equals the value.
 
     Args:
         seconds: Times of the values (N,), in s.
-        values: Values to filter (N, P), straight lines in between.
+        values: Values to filter (N, P), which change along straight lines between the times.
         time: Time constants of the filters (K,), in s.
     """
     share, mean = find_shares(np.diff(seconds)[:, None, None] / time[:, None])

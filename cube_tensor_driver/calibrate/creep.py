@@ -75,8 +75,9 @@ BEND = 0.05
 """Standard deviation that the second fit assumes for second differences of the creep law's
 amplitudes at successive relaxation times, divided by the mean amplitude.
 
-It is smaller than `FIRST_BEND`, because the second fit knows the growth of the amplitudes (creep by
-a power of time) from the first fit. Its second differences are 0 for amplitudes with this growth.
+It is smaller than `FIRST_BEND`, because the second fit knows from the first one by which factor q
+the amplitudes a_k grow from one relaxation time to the next. Its second differences
+a_k+1 - 2 q a_k + q² a_k-1 are 0 for amplitudes with exactly this growth.
 """
 
 FAST_ERROR = 0.02
@@ -89,8 +90,8 @@ readings of the pads in it are subtracted from all readings."""
 
 SETTLE_S = 1.0
 """Time, in s, after half of the load is reached, in which the load must become constant. Stress
-readings within this time are not fitted, nor those within the same time before and after the end
-of the load."""
+readings within this time are not fitted, nor are those within the same time before and after the
+end of the load."""
 
 MIN_HOLD_S = 60.0
 """Shortest duration, in s, for which the load must be held constant to determine creep. If it was
@@ -122,9 +123,9 @@ class CreepFit(NamedTuple):
         hold_s: Duration for which the load was held, in s.
         misfit: Rms difference between measured and computed readings, divided by the load.
         seconds: Times of averaged readings since the begin of the load (N,), in s.
-        before: Creep in the averaged readings (N, P), in Pa: under the load, the reading minus the
-            first one under it; after the load, the reading itself.
-        after: Error of the law (N, P), in Pa: averaged minus computed readings.
+        before: Measured creep (N, P), in Pa: averaged readings minus the first one under the load;
+            after the load, the averaged readings themselves.
+        after: Creep that the law does not explain (N, P), in Pa: averaged minus computed readings.
     """
 
     model: CreepModel
@@ -397,13 +398,13 @@ def _solve(
 
     Returns:
         Amplitudes of each pad (P, K); measured minus computed averages of the readings (N, P), in
-        Pa; and a change of the amplitudes (P, K) that stands for their uncertainty. It changes the
-        creep predicted under a long load by the standard deviation of this prediction.
+        Pa; and the uncertainty of the amplitudes as a change of them (P, K), which changes the
+        predicted creep under a long load by the standard deviation of this prediction.
     """
     n_times = means.memory.shape[1]
     held = means.reading[means.is_loaded > 0]
-    # About half of the relaxation times are shorter than the duration of the load, and only their
-    # amplitudes contribute to the creep under it. The mean amplitude follows from that.
+    # Only amplitudes whose relaxation time is shorter than the duration of the load contribute to
+    # the creep under it. They are about half of all amplitudes, and their sum is the creep.
     creep = np.abs(held[-1] / held[0] - 1).mean()
     mean_amplitude = 2 * creep / n_times
     identity = np.eye(n_times)

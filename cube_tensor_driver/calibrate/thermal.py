@@ -64,7 +64,8 @@ LAGS_S = np.geomspace(3.0, 1500.0, 26)
 the elastomer's lag behind the thermometer begins."""
 
 MAX_LAG_STEP = 1.01
-"""Ratio of successive estimates of a lag (time constant) below which the search for it ends."""
+"""Ratio of neighbouring time constants of low-pass filters in the search grid at which the search
+for the best ones ends. The grid begins with `LAGS_S` and becomes finer around the best ones."""
 
 LAG_ERROR = 0.05
 """Standard deviation of the error of the elastomer's temperature as low-pass filters compute it,
@@ -96,10 +97,10 @@ class Warming:
     Attributes:
         name: Bag and cube, for messages.
         seconds: Times of the blocks (N,), in s since the beginning of their bag.
-        first: Number of the first block of each bag.
+        first: For each bag, the index of its first block in the arrays.
         temperature: Measured temperatures (N,), in °C.
         stress: Stresses on the pads by the pad law (N, P), in Pa.
-        noise: Standard deviation of a pad's mean stress, in Pa.
+        noise: Standard deviation of the mean stress of a pad in a block by noise alone, in Pa.
     """
 
     name: str
@@ -172,10 +173,10 @@ class _Solution(NamedTuple):
     Attributes:
         lags: Time constants of the low-pass filters, in s, the longest first.
         behind: How far the filtered temperature u lags behind the measured one (N,), in K.
-        columns: Design matrix (N, K): 1, u, ..., u^degree, then the decay of the unknown difference
-            between elastomer and thermometer at the start.
+        columns: Design matrix (N, K): 1, u, ..., u^degree, then exp(-t / longest time constant),
+            by which the unknown initial difference of elastomer and thermometer decays.
         weight: Square roots of the weights (N,), in 1/Pa.
-        values: Coefficients (K, P).
+        values: Fitted coefficient of each column for each pad (K, P).
         residual: Measured minus fitted stresses (N, P), in Pa.
         misfit: Negative logarithm of the likelihood per stress, without constants.
     """
@@ -319,13 +320,13 @@ def _find_lags(
     data: Warming,
     choices: Sequence[tuple[float, ...]],
 ) -> dict[tuple[float, ...], Array]:
-    """Return how far the temperature after low-pass filters in series lags behind (N,), in K.
+    """Return the measured temperature minus that after low-pass filters in series (N,), in K.
 
-    At the begin of each bag, the output of the filters equals the measured temperature.
+    At the begin of each bag, both temperatures are equal.
 
     Args:
         data: Averages over N blocks of time.
-        choices: Choices of time constants of the filters, in s, which are the keys of the result.
+        choices: Sets of time constants of the filters, in s. Each is a key of the result.
     """
     times = sorted({lag for lags in choices for lag in lags})
     readings = np.column_stack([data.seconds, data.temperature])
@@ -351,7 +352,7 @@ def _solve(
         data: Averages over blocks of time.
         lags: Time constants, in s, of the low-pass filters that compute the temperature of the
             elastomer, the longest first.
-        behind: How far it lags behind the measured temperature (N,), in K.
+        behind: Measured temperature minus temperature of the elastomer (N,), in K.
         degree: Degree of the polynomial.
         slope: Rms of the linear coefficients over the pads, in Pa/K, for the weights of the blocks;
             0: not known yet.
@@ -362,8 +363,8 @@ def _solve(
     weight = 1 / np.hypot(data.noise, LAG_ERROR * slope * behind)
     weighted = columns * weight[:, None]
     normal = weighted.T @ weighted
-    # The prior of the last unknown: at the start, the temperature of the elastomer differs from the
-    # measured one by about 1 K.
+    # The prior of the last unknown states that, at the start, the temperature of the elastomer
+    # differs from the measured one by about 1 K.
     start_deviation = START_KELVIN * max(slope, 1.0)
     normal[-1, -1] += 1 / start_deviation**2
     values = np.linalg.solve(normal, weighted.T @ (data.stress * weight[:, None]))

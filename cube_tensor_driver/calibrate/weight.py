@@ -98,11 +98,12 @@ def fit_weight(path: Path, name: str | None = None) -> WeightFit:
 
 
 class _CubeFit(NamedTuple):
-    """Response of the pads of one cube, and its stresses, as in `WeightFit`.
+    """Fit of the response of one cube's pads to specific force.
 
     Attributes:
         response: Response (P, 3), in Pa per m/s², including the gains of the pads.
         variance: Variance of the response (P, 3).
+        seconds, before, after: Times and stresses of this cube, as in `WeightFit`.
     """
 
     response: Array
