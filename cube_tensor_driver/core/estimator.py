@@ -37,12 +37,12 @@ from .modes import Modes
 from .symmetry import Structure
 
 RANK_TOLERANCE = 1e-4
-"""Smallest independent part of a mode's response that is used to invert the response of a cube,
-relative to the strongest response of a mode.
+"""Smallest length of the independent part of a mode's response with which the mode's amplitude is
+computed, relative to the strongest response of a mode.
 
-The independent part is the one that modes with a stronger response do not explain. The response
-(pads x modes) is first divided by the noise of the pads. An amplitude that was computed from a
-smaller part would be mostly noise.
+The response of a mode is the vector of the stresses on the pads, divided by their noise. Its
+independent part is the one that modes with a stronger response do not explain. With a smaller one,
+the amplitude would be mostly noise.
 """
 
 LEAK_TOLERANCE = 1e-3

@@ -64,9 +64,10 @@ class LatestStress:
         self._over_limit = np.zeros(n_cubes, np.int64)
 
     def update(self, rows: StressRows, now: float) -> None:
-        """Store new rows (stress of one cube each); of several of one cube, the last is kept.
+        """Store new rows, each the stress of one sample of one cube.
 
-        Rows of cubes that the skin does not have are ignored.
+        If a cube has several new rows, the last one is kept. Rows of cubes that the skin does not
+        have are ignored.
 
         Args:
             rows: New rows.

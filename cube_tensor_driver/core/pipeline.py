@@ -542,9 +542,9 @@ class Pipeline:
         )
 
     def _add_table(self, key: int) -> None:
-        """Make the table of a calibration without some pads.
+        """Make the matrix of a calibration for cubes with some bad pads.
 
-        If there is no room for it, all tables of this kind are removed before.
+        If there is no room for it, all matrices for cubes with bad pads are removed before.
 
         Args:
             key: Number of the calibration * 2**32 + bit mask of the bad pads.

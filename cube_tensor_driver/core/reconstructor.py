@@ -225,9 +225,9 @@ class Reconstructor:
         """Return the errors (n, 15, k) of the newest rows of n cubes by k causes other than noise.
 
         The causes are errors of the compensation, and drift that could not be tracked. They are
-        independent, and each column has the size of one standard deviation. The errors of different
-        cubes in one column are about fully correlated, because the cubes have the temperature and
-        the motion in common.
+        independent, and each column has the size of one standard deviation. In one column, the
+        errors of different cubes are almost fully correlated, because all cubes have about the same
+        temperature and motion.
 
         Args:
             cubes: Numbers (n,) of the cubes.

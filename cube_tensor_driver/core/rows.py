@@ -212,7 +212,7 @@ class StressRows(_Rows):
 def concatenate(parts: Sequence[_Kind]) -> _Kind:
     """Return one table with the rows of one or more tables of the same class, in their order.
 
-    A column that a table lacks (None) is left out.
+    A column that one of the tables lacks (None) is left out of the result.
     """
     columns = [part.columns() for part in parts]
     common = [name for name in columns[0] if all(name in column for column in columns)]

@@ -25,7 +25,7 @@ from .layout import Layout
 from .modes import PLANE, SPACE, Modes
 
 POSITION_TOLERANCE = 1e-6
-"""Largest distance between a rotated pad and another pad with which it counts as coincident, in
+"""Largest distance between a rotated pad and another pad at which the two count as coincident, in
 units of d0 (half the side of the cube)."""
 
 _QUARTER_TURN_Z = (

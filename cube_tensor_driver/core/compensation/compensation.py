@@ -147,10 +147,10 @@ class Compensation:
             self.offsets.lasting[:] |= bits.astype(np.uint16)
 
     def pad_errors(self, cubes: Index) -> Array:
-        """Return the errors (n, P, k) of compensation by k independent causes, in Pa.
+        """Return the errors (n, P, k) of what is subtracted from the pads, in Pa.
 
-        They belong to the newest rows of n cubes. Each column has the size of one standard
-        deviation; k is 0 while nothing is compensated.
+        They are those of the newest rows of n cubes by k independent causes. Each column has the
+        size of one standard deviation; k is 0 while nothing is compensated.
 
         Args:
             cubes: Numbers of the cubes.
@@ -165,9 +165,10 @@ class Compensation:
         return found
 
     def states(self) -> dict[str, Array]:
-        """Return the state of creep and of temperature that earlier rows caused, by name, as (n,).
+        """Return the states of creep and of the effect of temperature (n,), by name of the effect.
 
-        After `restore` has set such a state, later rows give the same bits.
+        A state holds all that later rows need of the earlier ones: after `restore` has set it, the
+        later rows give the same bits.
         """
         states: dict[str, Array] = {}
         for effect in self._lasting:

@@ -8,19 +8,20 @@ reading u (strain times modulus) and K memories r_k, which are low-passed readin
     s = u - sum_k a_k r_k,      tau_k dr_k/dt = u - r_k
 
 In each step (`low_pass.py`), the memories r_k are advanced to the newest row of each cube, whose
-reading is u; d_k = u - r_k is how far they lag behind. From a row at the time t after it, with the
-reading u_1, is subtracted::
+reading is u; d_k = u - r_k is how far they lag behind. The time t later, the reading is u_1. If it
+has changed along a straight line, the creep sum_k a_k r_k has then become::
 
-    sum_k a_k r_k + (sum_k a_k m_k(t) d_k + (u_1 - u) sum_k a_k (1 - m_k(t) tau_k / t))
+    sum_k a_k r_k + (sum_k a_k m_k d_k + (u_1 - u) sum_k a_k (1 - m_k tau_k / t))
 
-with m_k(t) = 1 - exp(-t / tau_k), if the reading has changed along a straight line. Both sums in
-the large brackets are computed for the end of the step and divided by its length. The quotients
-count as constant during the step, so that the kernel only needs a slope and a gain.
+with m_k = 1 - exp(-t / tau_k). Both sums in the large brackets are computed once per step, for the
+t of the next scan or the length of a step, whichever is longer, and divided by t. The quotients are
+used as constants during the step, so that the kernel (the loop over rows) only needs a slope and a
+gain.
 
 Loads before the first row and within a long gap are unknown. The memories are computed as if there
 had been no load before the first row, and as if the reading had changed along a straight line
-within the gap. The share of a memory that comes from unknown loads decays with its relaxation time,
-and is part of the deviation.
+within the gap. The share of a memory that comes from unknown loads decays with its relaxation time.
+It causes an error, which `Creep.errors` states.
 
 A row is one sample of one cube, C the number of cubes of the skin, P the largest number of pads of
 a cube. Stresses are divided by the stiffness of the pads.
@@ -98,13 +99,13 @@ class Creep:
         self._reading = np.zeros(shape)
         # Fraction of each low-passed reading that depends on loads that were not measured.
         self._unknown = np.ones(time.shape)
-        # Largest reading of each pad that loads that were not measured are assumed to have caused.
+        # Largest reading of each pad that unmeasured loads are assumed to have caused.
         self._largest_unknown = np.zeros(shape)
         self._is_certain = np.ones(n_cubes, bool)
 
     @property
     def is_known(self) -> Mask:
-        """Whether a cube has a law of creep and unknown earlier loads matter little (C,)."""
+        """Whether a cube has a law of creep, and unknown earlier loads cause a small error (C,)."""
         return self.has_model & self._is_certain
 
     def advance(self, thermal: Array, end_ns: int) -> None:
@@ -120,7 +121,7 @@ class Creep:
         now = np.where(np.isnan(newest), self._reading, newest)
         newest_ns = self._newest.newest_ns
         ahead_s = np.maximum(end_ns - newest_ns, STEP_NS) * 1e-9
-        # A cube without any row so far has no earlier reading from which its first one differs.
+        # Before the first row of a cube, its reading is unknown. Infinity makes slope and gain 0.
         ahead_s[newest_ns == 0] = np.inf
         share = self._memories.advance(elapsed_ns * 1e-9, self._reading, now, ahead_s)
         # Over the interval, each filter replaces this share of its output by the readings of the
@@ -181,7 +182,7 @@ class Creep:
             self._is_certain[doubtful] = is_small.all(axis=1)
 
     def _find_unknown(self, cube: Index) -> Array:
-        """Return the standard deviation of creep because of unknown loads (n, P), in Pa.
+        """Return the standard deviation of computed creep that unknown loads cause (n, P), in Pa.
 
         The reading in a gap is taken as uniformly distributed from 0 to the larger one of the
         readings before and after the gap.
@@ -196,7 +197,7 @@ class Creep:
         return deviation
 
     def find_visible_share(self) -> Array:
-        """Return the fraction of a constant error of the readings that remains visible (C, P).
+        """Return the fraction of a constant error of the readings that is not subtracted (C, P).
 
         A wrong rest frequency adds a constant to the readings. The compensation takes a part of it
         for creep and subtracts this part, so an unloaded pad shows only the rest of the error. A

@@ -4,8 +4,8 @@
 
     time dx/dt = u - x
 
-The input u is a straight line from u_0 to u_1 over an interval of length t. How far the output
-lags behind is d = u - x. It changes from d_0 to d_1 over the interval:
+x is the output, `time` the time constant. The input u is a straight line from u_0 to u_1 over an
+interval of length t. The lag d = u - x of the output changes from d_0 to d_1 over the interval:
 
     d_1 = (1 - m) d_0 + (m time / t) (u_1 - u_0),      m = 1 - exp(-t / time)
 
@@ -32,11 +32,11 @@ the stress on a pad by 2 Pa within one step, less than the noise of one sample (
 """
 
 MAX_STEP_NS = MAX_GAP_NS + STEP_NS
-"""Longest interval between a cube's newest rows at two successive steps, in ns, in which load and
-temperature count as known.
+"""Longest interval, in ns, from the newest row (sample) of a cube at one step to its newest row at
+the next step, in which load and temperature count as known. In a longer one they count as unknown.
 
-It is `MAX_GAP_NS`, the same limit for two successive rows, plus one step, because more rows may
-follow a gap before the next step.
+For two successive rows, the limit is `MAX_GAP_NS`. A step is added to it here, because more rows
+may follow a gap before the next step.
 """
 
 HALVINGS = 10
@@ -85,10 +85,10 @@ class LowPass:
 
     Attributes:
         lag: How far the outputs of the filters lag behind the inputs (K, C, P).
-        sums: The following three (3, C, P).
-        output: Sum of weight × output over the filters (C, P). At the time t after the interval
-            with which `advance` was called, it is output + (slope + gain u) t, if the input is u
-            then, and was a straight line until then.
+        sums: The arrays `output`, `slope` and `gain` in one (3, C, P).
+        output: Sum of weight × output over the filters (C, P), at the end of the last interval.
+            At the time t after it, the sum is output + (slope + gain u) t, if the input has changed
+            to u along a straight line.
         slope: Factor of t (C, P), per second.
         gain: Factor of u t (C, P), per second.
     """
@@ -113,8 +113,8 @@ class LowPass:
             elapsed_s: Lengths of the intervals (C,), in s; 0 leaves the lags unchanged.
             before: Inputs at the begin of the interval (C, P).
             now: Inputs at its end (C, P); in between, they are straight lines.
-            ahead_s: Time after the interval (C,), in s, for which the sums are exact. They are
-                approximations for other times, and constant if it is infinite.
+            ahead_s: Time t after the interval (C,), in s, at which output + (slope + gain u) t is
+                exact; at other times, it is an approximation. Infinity makes slope and gain 0.
 
         Returns:
             Fraction m = 1 - exp(-elapsed_s / time) of each output that the interval replaced, as an
@@ -137,7 +137,11 @@ def _advance(
     share: Array,
     sums: Array,
 ) -> None:
-    """Advance filters; it specifies the function in C. The arguments are those of `LowPass`."""
+    """Advance the filters in numpy, with the same bits as the function in C.
+
+    The arguments are those of `LowPass` and its method `advance`. `lag`, `share` (the result of
+    `advance`) and `sums` are changed in place.
+    """
     output, slope, gain = sums
     sums[:] = 0
     for k, lag_k in enumerate(lag):

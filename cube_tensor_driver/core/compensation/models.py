@@ -174,9 +174,10 @@ class ThermalModel(EffectModel):
     """Stress, in Pa, that each pad of a cube in the skin measures without load, over temperature.
 
     It contains the drift of the electronics and the thermal stress that the expansion of the
-    elastomer causes, both including the gains (relative sensitivities) of the pads. The temperature
-    u of the elastomer, minus `reference`, is the measured one after low-pass filters, because the
-    elastomer lags behind the thermometer. Pad p measures sum_d coefficient_pd u^d, d = 1, 2, ...
+    elastomer causes, both including the gains (relative sensitivities) of the pads. Pad p measures
+    sum_d coefficient_pd u^d, d = 1, 2, ..., where u is the temperature of the elastomer minus
+    `reference`. The elastomer lags behind the thermometer, so its temperature is computed from the
+    measured one by low-pass filters.
 
     Attributes:
         reference: Temperature, in °C, at which the rest frequencies of the calibration hold.
@@ -184,9 +185,9 @@ class ThermalModel(EffectModel):
         coefficient: Coefficients of each pad (P, D), in Pa/K^d, the linear term first.
         deviation: Standard deviations of `coefficient` (P, D). The errors of all pads in a column
             are fully correlated; pads with equal signs err in the same direction. None: unknown.
-        ramp: Errors of the pads' stresses by K independent causes (P, K), in Pa per K by which the
-            filtered temperature lags behind the measured one, each with the size of one standard
-            deviation; None: they are not known.
+        ramp: Errors of the pads' stresses by K independent causes (P, K), each with the size of one
+            standard deviation, in Pa per K of difference between the measured and the filtered
+            temperature; None: they are not known.
     """
 
     key = "thermal"

@@ -23,8 +23,9 @@ from ..rows import FrequencyRows
 MAX_EXTRAPOLATION_NS = 20_000_000
 """Longest time, in ns, by which the motion is extrapolated beyond the instants at which it is
 known. If the nearest two instants are more than 10 ms apart, twice their interval is the limit.
+Beyond the limit, the motion counts as unknown.
 
-The specific force of an arm that is shaken with 2 g at 5 Hz is then wrong by less than 4 m/s².
+If an arm is shaken with 2 g at 5 Hz, its extrapolated specific force is wrong by less than 4 m/s².
 """
 
 MAX_INTERVAL_NS = 200_000_000
@@ -80,7 +81,7 @@ class ForcesAtCubes:
         stamp_ns = np.ascontiguousarray(rows.stamp_ns, np.int64)
         force = np.empty((len(rows), 3), np.float32)
         find_forces(*motion, self._position, self._rotation, cube, stamp_ns, force)
-        # This takes a third of the time of `dataclasses.replace`.
+        # A call of the class takes a third of the time of `dataclasses.replace`.
         return FrequencyRows(
             rows.cube,
             rows.sequence,
@@ -138,7 +139,7 @@ def _interpolate(time_ns: Times, known: Array, stamp_ns: Times) -> Array:
         state = np.full((len(stamp_ns), 4, 3), np.nan)
         state[:] = known if len(known) else np.nan
         return state
-    # Number of the instant before the interval that each time lies in, or is nearest to.
+    # For each time: number of the instant that begins the interval around it, or nearest to it.
     inner_ns = time_ns[1:-1]
     first = np.searchsorted(inner_ns, stamp_ns, side="right")
     length_ns = np.diff(time_ns)[first]

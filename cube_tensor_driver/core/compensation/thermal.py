@@ -73,8 +73,8 @@ class Thermal:
             weight[cube, :n_lags] = filter_weights(lag[cube, :n_lags])
         self._filters = LowPass(lag.T, weight.T[..., None])
         self._reference = tabulate(models, "reference", ())
-        # Stresses of the pads, and their errors by independent causes (C, P, k), in Pa per K or
-        # power of K.
+        # Attributes of the models as tables: coefficients and their deviations (C, P, degree), in
+        # Pa per power of K, and `ramp` (C, P, causes), in Pa/K; 0 where a cube has no model.
         self._coefficient, self._deviation, self._ramp = (
             tabulate(models, name, (n_pads, 0)) for name in ("coefficient", "deviation", "ramp")
         )
@@ -84,7 +84,8 @@ class Thermal:
         self._linear_size, self._ramp_size = (
             np.sqrt((values**2).sum(axis=(1, 2)) / own_pads) for values in (linear, self._ramp)
         )
-        # Stresses / stiffness, the highest power first (D, C, P); 0 for a missing pad.
+        # Coefficients divided by the stiffness of the pads, the highest power first (D, C, P), for
+        # Horner's scheme; 0 for a pad that the cube does not have.
         stiffness = np.where(pipeline.stiffness > 0, pipeline.stiffness, np.inf)
         self._relative = np.moveaxis(self._coefficient, 2, 0)[::-1] / stiffness
         self._endless = np.full(n_cubes, np.inf)
@@ -135,7 +136,13 @@ class Thermal:
         self._update()
 
     def _filter(self, elapsed_s: Real, before: Array, now: Array) -> Array:
-        """Advance the filters by intervals (C,), in s, between temperatures (C,), in °C."""
+        """Advance the filters by intervals (C,), in s, and return the fractions of `LowPass`.
+
+        Args:
+            elapsed_s: Lengths of the intervals (C,), in s.
+            before: Measured temperatures at the begin of the intervals (C,), in °C.
+            now: Measured temperatures at their end (C,), in °C.
+        """
         # An unknown temperature does not change, so any number may stand for it.
         first, last = inputs = np.array([before, now])[..., None]
         inputs[np.isnan(inputs)] = 0

@@ -38,8 +38,8 @@ class Weight:
     def errors(self, cubes: Index, force: Array) -> Array:
         """Return the errors (n, P, 3) of the compensation of weight by independent causes, in Pa.
 
-        The causes are the three axes. Each column has the size of one standard deviation. An
-        unknown specific force is taken as 0 with a standard deviation of 1 g along each axis.
+        Each axis of the cube is one cause, and each column has the size of one standard deviation.
+        An unknown specific force is taken as 0 with a standard deviation of 1 g along each axis.
 
         Args:
             cubes: Numbers of n cubes.

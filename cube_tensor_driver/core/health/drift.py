@@ -4,12 +4,11 @@
 
 The frequency of a pad without load changes over minutes and hours (temperature, ageing). While
 nothing touches a cube, its rest frequencies follow the measured ones with a first-order low-pass
-filter. While something touches the cube, its own frequencies do not show its drift: the part of the
-drift that could not come from a load is orthogonal to the response of all modes, so that it changes
-no stress, and the other part looks like a load. The unloaded cubes of the skin show the drift that
-all cubes have in common. So the rest frequencies of a loaded cube follow the median drift of the
-unloaded ones. If fewer than `MIN_UNLOADED_CUBES` are unloaded, the rest frequencies of a loaded
-cube are kept. The drift that may remain is stated as a standard deviation.
+filter. While something touches the cube, its drift cannot be told from the load, except for a part
+that changes no stress. But the unloaded cubes of the skin show the drift that all cubes have in
+common, so the rest frequencies of a loaded cube follow the median drift of the unloaded ones. If
+fewer than `MIN_UNLOADED_CUBES` are unloaded, the rest frequencies of a loaded cube are kept. The
+drift that may remain is stated as a standard deviation.
 """
 
 from __future__ import annotations
@@ -70,8 +69,8 @@ class DriftTracker:
     loaded cube follow the median drift of the unloaded cubes with the same layout.
 
     Attributes:
-        deviation: Standard deviation of the drift of a loaded cube minus the drift that is
-            corrected (cubes,), relative to the rest frequencies; 0 for an unloaded cube.
+        deviation: Standard deviation of the drift that remains uncorrected at a loaded cube
+            (cubes,), relative to the rest frequencies; 0 for an unloaded cube.
     """
 
     def __init__(self, health: Health) -> None:
@@ -83,8 +82,8 @@ class DriftTracker:
         n_cubes = len(pipeline.calibrations)
         self._unloaded_windows = np.zeros(n_cubes, int)
         self._windows = 0
-        # Rest frequencies at the last tare, then two numbers of windows for each cube: those since
-        # the tare in which it was unloaded, and those since it was unloaded for the last time.
+        # Rest frequencies at the last tare. Then, for each cube: the number of windows since the
+        # tare in which it was unloaded, and the number of windows for which it has been loaded now.
         self._tared_rest = self._rest_in_use
         self._followed_windows = np.zeros(n_cubes, int)
         self._loaded_windows = np.zeros(n_cubes, int)
@@ -132,9 +131,10 @@ class DriftTracker:
     ) -> None:
         """Correct the drift of loaded cubes by the median of unloaded ones, and set `deviation`.
 
-        The drift of a loaded cube is assumed to differ from the median by the standard deviation of
-        the rates of drift of the unloaded cubes since the last tare, times the time for which the
-        cube is loaded.
+        The rates of drift since the last tare differ between the unloaded cubes of a layout. Their
+        standard deviation, times the time for which a cube has been loaded, is its `deviation`. If
+        too few cubes are unloaded, the rms of the rates of all cubes is used instead, because no
+        drift is corrected then.
 
         Args:
             change: Changes of the tracked rest frequencies in this window (cubes, P), in Hz. Those

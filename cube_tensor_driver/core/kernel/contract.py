@@ -44,8 +44,8 @@ NEEDS_CONDITION = -3
 """Result of the kernel (the loop over rows of frequencies): it has stopped before a row.
 
 A pad of this row has an impossible frequency, or the device reports it as broken. The health of
-pads is assessed over windows of 0.5 s, so the kernel stops at the first such row of a cube in a
-window only.
+pads is assessed over windows of 0.5 s, so in each window, the kernel stops only at the first such
+row of a pad.
 
 The caller finds the condition of the pad (open, short, out of range or reported), and calls the
 kernel again from that row on.

@@ -113,9 +113,9 @@ def temperature_factor(
     calibration: Numbers,
     temperature: Real,
 ) -> Array:
-    """Return the ratio of rest frequencies at temperatures to those at the reference (N, P).
+    """Return the rest frequencies at temperatures, relative to the reference temperature (N, P).
 
-    It is 1 without a temperature model, and for an unknown temperature.
+    The ratio is 1 without a temperature model, and for an unknown temperature.
 
     Args:
         tables: Tables of the skin.
