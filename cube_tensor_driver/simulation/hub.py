@@ -175,7 +175,7 @@ class SimulatedHub:
         return b"".join(self._answer(request, now_us) for request in requests)
 
     def is_due(self, now_us: int) -> bool:
-        """Return whether the hub takes samples and the next one is due at simulated `now_us`."""
+        """Return whether the hub takes samples and the next one is due at the time `now_us`."""
         return self.started and self.next_us <= now_us
 
     def sample(self, frequency: Millihertz) -> bytes:

@@ -63,7 +63,7 @@ def _make_table_schema(columns: str, *schemas: JsonSchema) -> JsonSchema:
     """Return the schema of a list of rows of numbers.
 
     Args:
-        columns: Names of the columns, as in an error message.
+        columns: Names of the columns, for error messages.
         schemas: Schema of the number in each column.
     """
     row = {

@@ -54,11 +54,12 @@ class SimulatedLink:
         line: Line between hub and host.
         damaged: Samples whose frame was altered or not sent: for each, the number of the hub's
             restarts before, and the number of the sample.
-        frame_faults: Kinds of faults for the next SAMPLE frames (messages with a sample), one for
-            each.
+        frame_faults: Kinds of faults for the next SAMPLE frames (messages with a sample), one kind
+            for each frame.
         held_back: Frame that is sent after the next one (fault `reorder`).
         faults: Faults with a duration that act now, in the order of their begins.
-        first_readings: Frequency in mHz of a pad at the first sample after its fault began.
+        first_readings: Fault of a pad -> frequency in mHz of the pad at the first sample after the
+            fault began. The fault `stuck` repeats this frequency.
     """
 
     name: str
@@ -105,7 +106,7 @@ class SimulatedLink:
         self.line.send(self.hub.hello(), now_us)
 
     def update_hub(self) -> None:
-        """Let the hub state what the present faults make it state."""
+        """Set the uid, pads, protocol version and failed pads that the hub reports under faults."""
         kinds = {record.fault.kind for record in self.faults}
         hub = self.hub
         hub.false_uid = None
@@ -217,7 +218,7 @@ class Injector:
             duration_s = max(fault.seconds, 1e-6)
             share = min(1.0, elapsed_s / duration_s)
             rise = share * fault.value
-            # A rise of 0 ends the fault. The hub then reports no temperature, as before it.
+            # A rise of 0 ends the fault. Then the hub reports no temperature, as before the fault.
             link.hub.celsius = TEMPERATURE_UNKNOWN
             if rise:
                 link.hub.celsius = round(100 * (ROOM_CELSIUS + rise))

@@ -72,7 +72,10 @@ class MovingFrame:
         self._numbers = np.arange(len(knots))
 
     def _compute_pose(self, seconds: float) -> tuple[Array, Array]:
-        """Return position (3,), in m, and rotation (3, 3) of the parent frame at a time in s."""
+        """Return position (3,), in m, and rotation (3, 3) of the parent frame at a time in s.
+
+        Between two knots, position and angles follow half a period of a cosine.
+        """
         number = np.interp(seconds, self._times, self._numbers)
         begin = np.floor(number)
         phase = np.pi * (number - begin)
@@ -81,7 +84,7 @@ class MovingFrame:
         return np.array(values[:3]), rotation_from_rpy(*values[3:])
 
     def angular_velocity(self, seconds: float) -> Array:
-        """Return the angular velocity (3,) at a time in s, along the parent frame, in rad/s."""
+        """Return the angular velocity (3,) in rad/s, in the parent frame, at a time in s."""
         times = seconds - STEP_S, seconds, seconds + STEP_S
         (_, before), (_, now), (_, after) = map(self._compute_pose, times)
         turning = now.T @ (after - before) / (2 * STEP_S)
@@ -120,7 +123,7 @@ class MovingFrame:
 
 
 class HeavyPads:
-    """Computes the specific force at some cubes of a moving skin, and the stress of pads by it."""
+    """Computes the specific force at cubes of a moving skin and the stress of their pads by it."""
 
     def __init__(
         self,
@@ -140,7 +143,7 @@ class HeavyPads:
         self._frame = MovingFrame(knots)
 
     def specific_force(self, seconds: float) -> Array:
-        """Return the specific force at each cube in its own frame (cubes, 3), in m/s²."""
+        """Return the specific force (cubes, 3) in m/s² at each cube, in the frame of the cube."""
         return self._frame.specific_force(seconds, self._cubes.position, self._cubes.rotation)
 
     def stress(self, seconds: float) -> Array:

@@ -178,7 +178,8 @@ class Simulator:
     def run(self, stop: StopRequest) -> None:
         """Simulate the hubs until a stop is requested.
 
-        They send HELLO and STATS at 1 Hz, and samples after the host has requested them (START).
+        The hubs send HELLO and STATS at 1 Hz, and samples after the host has requested them
+        (START).
         """
         report_us = REPORT_PERIOD_US
         while not stop.is_due(self._is_needed()):
@@ -344,9 +345,9 @@ class StopRequest:
     ) -> None:
         """Request the stop; this method is also the handler of SIGINT and SIGTERM.
 
-        Ctrl-C sends SIGINT to the simulator and to the driver at the same time. A driver would
-        report links that end before it has closed them as lost. So after SIGINT, the simulator
-        waits up to `MAX_WAIT_S` for the driver.
+        Ctrl-C sends SIGINT to the simulator and to the driver at the same time. If a link ended
+        before the driver has closed it, the driver would report the link as lost. So after SIGINT,
+        the simulator waits up to `MAX_WAIT_S` for the driver.
 
         Args:
             number: Number of the signal.

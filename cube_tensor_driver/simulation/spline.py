@@ -6,8 +6,8 @@ They are computed here, because importing scipy.interpolate would more than doub
 simulator needs to start.
 
 The curve is a sum of cubic B-splines with control points c. Its position at the point i is
-(c[i-1] + 4 c[i] + c[i+1]) / 6. Control points beyond an end mirror those inside, which makes the
-velocity 0 there; those of a closed curve repeat.
+(c[i-1] + 4 c[i] + c[i+1]) / 6. In an open curve, the control points beyond an end mirror those
+inside, so that the velocity at the end is 0. In a closed curve, the control points repeat.
 
 Source: C. de Boor, A Practical Guide to Splines (1978), chapter IX.
 """
@@ -30,8 +30,8 @@ _POWERS = (
     )
     / 6
 )
-"""Coefficients (4, 4) of the powers of t, which runs from 0 to 1 between two points, for each of
-the four control points that determine this part of the curve."""
+"""Coefficients (4, 4) of the part of the curve between two points, in which t runs from 0 to 1. Row
+k has the coefficients of t^k, one for each of the four control points that determine this part."""
 
 
 class CubicSpline:
@@ -50,7 +50,8 @@ class CubicSpline:
         """
         knots = points[:-1] if closed else points
         n = len(knots)
-        # Row i + 1 of `extend` takes the control point c[i] from those of the knots.
+        # Row i + 1 of `extend` selects the control point c[i] from the n control points of the
+        # knots. The first and last rows select those that mirror or repeat them beyond the ends.
         rows_added = ((1, 1 + closed), (0, 0))
         identity = np.eye(n)
         if closed:

@@ -66,7 +66,11 @@ class ThermalLayer(NamedTuple):
 
 
 def read_thermal_stress(name: str, n_pads: int) -> ThermalLayer:
-    """Read a file of thermal stress, a shipped one by its name or another by its path.
+    """Read a file of thermal stress that `./cube fem --load temperature -o` has written.
+
+    Args:
+        name: Path of the file, or the name of one in the package.
+        n_pads: Number of pads P that the cubes have.
 
     Raises:
         ConfigError: There is no such file, or it has another number of pads.
@@ -103,7 +107,7 @@ def read_thermal_stress(name: str, n_pads: int) -> ThermalLayer:
 class WarmLayer:
     """Computes the temperature across the elastomer layer at some cubes as time advances.
 
-    It follows from the temperatures of the ground below the layer and of the air above it.
+    The temperature in the layer follows from those of the ground below it and of the air above it.
     """
 
     def __init__(
@@ -144,7 +148,12 @@ class WarmLayer:
         self._amplitude = self._steady
 
     def _find_steady(self, ground: float, air: float) -> Array:
-        """Return the amplitudes of the steady state under temperatures of ground and air, in °C."""
+        """Return the amplitude of each eigenvector (cubes, `CELLS`) in the steady state, in °C.
+
+        Args:
+            ground: Constant temperature of the ground, in °C.
+            air: Constant temperature of the air, in °C.
+        """
         return np.asarray(ground * self._from_ground + air * self._from_air)
 
     @property
@@ -208,12 +217,13 @@ class ThermalPads:
 
         ground = np.array(imperfections.temperature).T
         air = np.array(imperfections.air).T if imperfections.air else ground[:, :1]
-        # Rows of both: times in s, temperatures in °C.
+        # The two rows of each array are times in s and temperatures in °C.
         self._knots = [ground, air]
         self._seconds = 0.0
         outside = self._outside(0.0)
         self._layer = WarmLayer(height, imperfections.heat_exchange, *outside)
 
+        # Centres of the finite volumes, from -1 at the ground to 1 at the surface.
         s = (2 * np.arange(CELLS) + 1) / CELLS - 1
         # The temperatures are fitted by least squares, because Legendre polynomials are not
         # orthogonal on a grid.

@@ -194,8 +194,9 @@ class MujocoSkin:
 
     def touches(self) -> list[BodyContact]:
         """Return all contacts of the skin in the state of `data`."""
-        # Contact points of each pair: body of the skin, whether it is the first (0) or the second
-        # (1) of the two bodies, and geom (shape) that touches it.
+        # Numbers of the contact points in MuJoCo's list for each pair of bodies. The key has the
+        # body of the skin, whether it is the first (0) or the second (1) of the two bodies, and the
+        # geom (shape) that touches it.
         pairs = defaultdict(list)
         geoms = self.data.contact.geom[: self.data.ncon]
         for row, (first, second) in enumerate(geoms.tolist()):
@@ -284,8 +285,8 @@ class MujocoSkin:
                 radius,
             )
             return BodyContact(part.body, load, polygon)
-        # For a Hertz contact, the curvatures (1 / radius) of both bodies add up (Johnson 4.2). That
-        # of other shapes is taken as 0.
+        # For a Hertz contact, the curvatures (1 / radius) of both bodies add up (Johnson 4.2).
+        # Shapes other than sphere, capsule and cylinder count as flat, with the curvature 0.
         model = self.model
         curvature = sum(
             1 / model.geom_size[geom, 0]
@@ -428,7 +429,7 @@ class MujocoSkin:
             body: Number of the body.
             place: Position (3,) of the cube in the world, in m.
             outward: z axis (3,) of the cube in the world.
-            cube: The cube, for messages.
+            cube: The cube, for error messages.
 
         Raises:
             ConfigError: There is no geom above the cube.
