@@ -82,7 +82,7 @@ def run_demo(settings: DemoSettings) -> int:
         CubeError: A file or option cannot be used, a process does not start, or another skin
             publishes in this DDS domain.
     """
-    # From here on Ctrl-C only sets this event. The loop in `watch` ends by it, and `Children` then
+    # From here on, Ctrl-C only sets this event, which ends the loop in `watch`. Then `Children`
     # ends all processes.
     interrupted = stop_event()
     if is_domain_used():

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Comparison of the tensors that arrived with the load on the simulated skin.
 
-Only the demo needs this. The module `verification`, which `./cube bench` and the tests use too,
-compares the samples that were sent with those that were received.
+Only the demo needs this module. The module `verification`, which `./cube bench` and the tests use,
+too, compares the samples that were sent with those that were received.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""A ROS node that receives messages of nodes in child processes, and checks that these still run.
+"""A ROS node that receives messages of nodes in child processes and checks that they still run.
 
 `./cube demo`, torture and bench use it.
 """

@@ -27,9 +27,10 @@ class Arrivals:
     """Stores which rows (one cube at one sampling time) have arrived, and when.
 
     Attributes:
-        row_count: (cubes,) number of rows that a stored row of each cube counts as: 1. A subclass
-            may store the rows of one cube per hub, which then count for all cubes of the hub; cubes
-            whose rows are not stored have 0.
+        row_count: (cubes,) number of rows for which one stored row of each cube stands; here 1. A
+            subclass may store the rows of only one cube of each hub. Then a row of this cube stands
+            for the rows of all cubes of the hub. The value is 0 for cubes whose rows are not
+            stored.
         rows: Number of rows that have arrived, stored or not.
     """
 

@@ -174,7 +174,7 @@ def watch(
 
 
 def check_no_skin() -> None:
-    """Check, before the demo starts its own skin, that none publishes in this DDS domain.
+    """Check, before the demo starts its skin, that no other skin publishes in this DDS domain.
 
     Raises:
         CubeError: A skin publishes.

@@ -14,7 +14,8 @@ If the values on one side of zero are all noise, the axis ends at zero on that s
 
 
 ROUNDING_ERROR = 1e-9
-"""Relative tolerance, so that a length of exactly 1, 2 or 5 does not become the next number."""
+"""Relative tolerance that allows for rounding errors of floating-point numbers. Without it, a
+length of exactly 1, 2 or 5 could be rounded to another round number."""
 
 
 def round_down(length: float) -> float:
@@ -28,9 +29,10 @@ def round_down(length: float) -> float:
 def round_range(low: float, high: float) -> tuple[float, float]:
     """Return the range of an axis that contains zero and the values from `low` to `high`.
 
-    Its ends are multiples of a step, which is half of 1, 2, 5 or 10 times a power of ten. The range
-    therefore changes seldom while the values change. A side on which no value exceeds `NOISE_SHARE`
-    of the largest one ends at zero.
+    The ends are multiples of a step: half of the smallest number of the form 1, 2 or 5 times a
+    power of ten that is not below the largest absolute value. So the range changes seldom while the
+    values change. On a side of zero on which no absolute value exceeds `NOISE_SHARE` of the largest
+    one, the range ends at zero.
     """
     size = max(-low, high, 1e-9)
     min_step = size * (1 - ROUNDING_ERROR)

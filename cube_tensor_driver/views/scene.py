@@ -191,7 +191,8 @@ def choose_automatic_top(
 ) -> float:
     """Return the upper end, in SI units, of an automatic range of colours or arrow lengths.
 
-    It follows a rise of the values at once, and a fall slowly (factor `RANGE_DECAY` per picture).
+    If the values rise, the upper end rises at once. If they fall, it falls slowly (by the factor
+    `RANGE_DECAY` per picture).
 
     Args:
         quantity: The quantity that is shown.
@@ -344,7 +345,7 @@ def make_gradient_arrows(
     gradient = -np.nan_to_num(values[:, columns])
     in_cube = gradient * length
     arrow = np.einsum("nij,nj->ni", poses.rotation[:, :, :2], in_cube)
-    # The arrows lie a little above the upper faces, so that these do not hide them.
+    # The arrows lie a little above the upper faces, so that the faces do not hide the arrows.
     tail = above(poses, 1.15)
     return np.stack([tail, tail + arrow], axis=1)
 
@@ -399,7 +400,7 @@ def make_fault_crosses(poses: CubePoses, health: AnyArray) -> Array:
     ends = np.where(has_fault[:, None, None, None], cross, 0.0)
     scaled = ends * poses.half_side[:, None, None, None]
     in_parent = np.einsum("nij,nabj->nabi", poses.rotation, scaled)
-    # The crosses lie a little above the upper face, so that the face does not hide them.
+    # The crosses lie a little above the upper faces, so that the faces do not hide the crosses.
     centre = above(poses, CROSS_HEIGHT)
     return np.asarray(centre[:, None, None] + in_parent)
 

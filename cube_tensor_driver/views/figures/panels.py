@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Curves over time in panels one below the other: of `./cube plot`, and as the page saves them."""
+"""Curves over time in panels one below the other, for `./cube plot` and for the browser page."""
 
 from __future__ import annotations
 

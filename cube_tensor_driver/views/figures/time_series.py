@@ -85,7 +85,7 @@ def read_cube_series(
             f"{bag.path}: no sample of {cubes[number].name} from {start_s:g} to {end_s:g} s; "
             f"the bag is {length:.3f} s long"
         )
-    # Of a long recording only every n-th sample is drawn, see `MAX_POINTS`.
+    # In a long recording only every n-th sample is drawn, see `MAX_POINTS`.
     drawn = slice(None, None, math.ceil(n_samples / MAX_POINTS))
     drawn_rows = concatenate(parts).select(drawn)
     return TimeSeries(

@@ -40,7 +40,7 @@ UNOBSERVED = "·"
 """Character that the table shows instead of a value that is not observed (NaN)."""
 
 PRESSURE = "pressure"
-"""Heading of the column with the bars."""
+"""Heading of the column with bars, whose lengths show the pressure at each cube."""
 
 BAR_WIDTH = 12
 """Width, in characters, of the longest bar in the column for the pressure."""
@@ -125,7 +125,7 @@ class LiveTable:
     def update(self, rows: StressRows) -> None:
         """Store the rows of a stress message, which the next `refresh` shows.
 
-        Of several rows of one cube, the last one is shown.
+        If a cube has several rows, the last one is shown.
         """
         if not self._latest.count.any():
             # The next `refresh` draws the first tensors without waiting for `DRAW_PERIOD_S`.
@@ -223,7 +223,12 @@ class LiveTable:
         return columns
 
     def _make_table(self, columns: Mapping[str, Cells], has_lines: bool) -> Table:
-        """Make the table with these columns, which have lines between them or not."""
+        """Make the table.
+
+        Args:
+            columns: Cells of each column by its heading.
+            has_lines: Whether lines separate the columns.
+        """
         count = counted(len(self._skin.cubes), "cube")
         title = f"skin {self._skin.name!r}: {count}. Tension is positive; "
         table = Table(title=f"{title}{UNOBSERVED} is not observed{self.note}")
