@@ -91,7 +91,7 @@ def write_grid(options: argparse.Namespace) -> int:
     from ..core.errors import ConfigError
     from ..views.terminal.output import counted, working
 
-    # Each option has the name of its argument of `grid`.
+    # Each option has the name of the argument of `describe_grid` that it sets.
     names = "name", "nx", "ny", "pitch", "links", "calibration", "layout", "rate", "port"
     skin = describe_grid(**{name: getattr(options, name) for name in names})
     checked, mistakes = check_skin_data(skin, options.output.parent)

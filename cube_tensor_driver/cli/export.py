@@ -67,8 +67,8 @@ def add_arguments(parser: Parser) -> None:
     for name, text in TABLES.items():
         table = parser.add_subcommand(name, text)
         _add_common(table)
-        # The command `reprocess` makes the tables. Its options that these subcommands do not have
-        # are set to their defaults.
+        # The command `reprocess` makes the tables. Those of its options that these subcommands lack
+        # are set here.
         table.set_defaults(format=name, contacts=None)
         table.add_jobs()
 

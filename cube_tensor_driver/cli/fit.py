@@ -294,8 +294,8 @@ def read_inputs(
         # Unloaded rows cannot be found in a bag, because a reference sensor never measures exactly
         # 0. Therefore the rest frequencies are those of the last tare during the recording.
         rest, rest_source = base.rest_frequency, "of the bag, after tare"
-    # A bag contains frequencies but no table of loads; only with --reference, which names the topic
-    # of a reference sensor, the loads can be taken from it.
+    # A bag contains frequencies but no table of loads. Loads can be read from a bag only with
+    # --reference, which names the recorded topic of a reference sensor.
     elif is_bag(options.loads):
         raise ConfigError(
             f"{options.loads} is a bag: name the topic to fit to with --reference; "

@@ -36,8 +36,9 @@ RESEND_S = 0.2
 """Time, in seconds, after which SIGINT is sent again if Python has lost the KeyboardInterrupt of a
 Ctrl-C (see `interrupt_again`).
 
-The time is long enough for `sys.unraisablehook`, in which a second signal would be lost as well, to
-return even on a busy machine, and so short that a user does not notice it.
+A signal that arrives before `sys.unraisablehook` has returned would be lost as well. The time is
+long enough for this function to return even on a busy machine, and so short that a user does not
+notice it.
 """
 
 WHEELS = {

@@ -280,7 +280,7 @@ def formatter(prog: str) -> argparse.HelpFormatter:
 
 
 def columns() -> int:
-    """Return the width of help texts, in characters: that of the terminal, or `MAX_WIDTH`."""
+    """Return the width of help texts, in characters: that of the terminal, at most `MAX_WIDTH`."""
     return min(shutil.get_terminal_size().columns, MAX_WIDTH)
 
 

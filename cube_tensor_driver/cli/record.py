@@ -69,7 +69,7 @@ def run(options: argparse.Namespace) -> int:
             options.output,
             options.topics,
             storage=options.storage,
-            # A limit of 0 means that the file is never split for this reason.
+            # With the value 0, size or duration of a file of the bag has no limit.
             max_bytes=round((options.split_size or 0) * 1e6),
             max_seconds=options.split_time or 0.0,
             duration=options.duration,
@@ -104,7 +104,7 @@ class RecordingStatus:
 
         Args:
             recorder: The recorder, which counts the messages.
-            seconds: Time since the first message, in s.
+            seconds: Time since the start of the command, in s.
         """
         missing, refused = recorder.missing, recorder.refused
         waiting = f"; waiting for {', '.join(missing)}" if missing else ""

@@ -190,8 +190,8 @@ def read_contact_options(options: argparse.Namespace) -> ContactOptions | None:
     if method not in CONTACT_METHODS:
         raise ConfigError(f"--contacts {method}: the methods are {', '.join(CONTACT_METHODS)}")
 
-    # Only the numbers and the influence table can be assigned. The other parameters of the node
-    # `contacts` do not affect the computed contacts.
+    # The option can set only those parameters of the node `contacts` that are numbers, and the
+    # influence table. The other parameters do not affect the computed contacts.
     known = {}
     for one in CONTACTS:
         if one.span is not None or one.name == "influence":
