@@ -415,7 +415,7 @@ class NodeClock:
         self.is_simulated = isinstance(clock, ROSClock) and clock.ros_time_is_active
 
     def now_ns(self) -> int:
-        """Return the time of the node's clock, in ns since the Unix epoch, or simulated time."""
+        """Return the time of the node's clock, in ns: since the Unix epoch, or simulated time."""
         if self.is_simulated:
             return int(self._node.get_clock().now().nanoseconds)
         return time.time_ns()

@@ -29,8 +29,8 @@ from .serialised import Colour, Shape, make_lines, make_text, serialise
 PLATE_SIDE = 2.04
 """Side of the square plate that shows the colour of a cube, divided by half the side of the cube.
 
-The plate is slightly larger than the upper face of the cube (2), which it covers. RViz draws the
-cube itself from the URDF of the skin.
+The plate covers the upper face of the cube and is slightly larger: in this unit, the side of the
+face is 2. RViz draws the cube itself from the URDF of the skin.
 """
 
 PLATE_THICKNESS = 0.3
@@ -260,7 +260,7 @@ def _make_plates(poses: CubePoses) -> list[tuple[Index, Shape]]:
         strict=True,
     )
     for number, (members, rotation, (w, x, y, z)) in enumerate(oriented):
-        # All boxes of a marker have the same size, so that of the largest cube is taken.
+        # All plates of a marker have the same size, so they get the size for the largest cube.
         half_side = float(poses.half_side[members].max())
         side = PLATE_SIDE * half_side
         shape = Shape(

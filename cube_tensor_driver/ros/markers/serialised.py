@@ -35,8 +35,8 @@ NO_ROWS = np.empty((0, 3))
 
 
 EMPTY_TEXT = (1, 0)
-"""Serialised empty text, as integers of 4 bytes: its length with the closing zero byte, and this
-byte with three bytes that fill the space before the next number."""
+"""Serialised empty text, as two integers of 4 bytes. The first one is the length of the text, which
+includes the closing zero byte. The second one is this byte, with three bytes of padding."""
 
 
 class Shape(NamedTuple):
@@ -138,11 +138,12 @@ def serialise(frame_id: str, shapes: Sequence[Shape]) -> bytes:
         colours = np.ones((len(shape.colours), 4), np.float32)  # the last column is the opacity
         colours[:, :3] = shape.colours
         message.add_sequence("f4", colours)
-        # The texture: its resource, an image (stamp, frame id, format, number of bytes), and the
-        # number of coordinates.
+        # The marker has no texture. The empty fields of the texture are the resource, the image
+        # (stamp, frame id, format and number of bytes), and the number of coordinates.
         message.add("u4", (*EMPTY_TEXT, 0, 0, *EMPTY_TEXT, *EMPTY_TEXT, 0, 0))
         message.add_text(shape.text)
-        # The mesh: its resource, and a file (name, number of bytes).
+        # The marker has no mesh. The empty fields of the mesh are the resource and the file (name
+        # and number of bytes).
         message.add("u4", (*EMPTY_TEXT, *EMPTY_TEXT, 0))
         message.add("?", False)
     return bytes(message.data)

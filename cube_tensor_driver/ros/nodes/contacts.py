@@ -48,7 +48,7 @@ class Contacts(SkinSubscriberNode):
     per area on the surface of the skin, and checks at each message of `stress` whether a contact
     begins to slip. If so, it publishes the last contacts again at once with their new states of
     slip, because a hand that loses an object must react before the next regular message.
-    `touch` gives the ids of the touches that the contacts belong to.
+    The ids of the touches that the contacts belong to come from the topic `touch`.
 
     The `ContactFinder` is set up in another thread, because that may take long on a large skin and
     the node must answer requests meanwhile. Nothing is published before it is ready.
@@ -173,7 +173,7 @@ class Contacts(SkinSubscriberNode):
         self._touch = data
 
     def _read_touches(self) -> Touches:
-        """Return the newest touches: their cubes and ids."""
+        """Return the cubes and ids of the newest touches; the other fields are empty."""
         if not self._touch:
             return NO_TOUCHES
         message = deserialize_message(self._touch, SkinTouch)

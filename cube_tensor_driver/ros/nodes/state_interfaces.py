@@ -42,8 +42,8 @@ because the hardware component of ros2_control does not get messages that were s
 subscribed."""
 
 CHECK_PERIOD_S = 0.1
-"""Time, in s, between two checks for cubes whose last row (sample) is too old, and for new
-subscribers."""
+"""Time, in s, between two checks. A check sets the wrenches of cubes whose last row (sample) is too
+old to NaN, and sends the names of the state interfaces to new subscribers."""
 
 LAST_VALUES_S = 0.2
 """Time, in s, for which NaN is repeated before the publisher of the values is destroyed. DDS
@@ -51,8 +51,8 @@ discards what a subscriber has not yet taken when the publisher ends, so that a 
 that is late by a few milliseconds would miss a single message."""
 
 LAST_VALUES_PERIOD_S = 0.02
-"""Time, in s, between two of the last messages, which are sent for `LAST_VALUES_S` and set all
-wrenches to NaN."""
+"""Time, in s, between two of the messages with NaN for all wrenches that the node sends for
+`LAST_VALUES_S` before its publisher of the values is destroyed."""
 
 
 class SkinWrenches:
@@ -149,7 +149,8 @@ def make_state_interfaces(node: CubeNode, skin: Skin) -> StateInterfaces | None:
         skin: The skin.
 
     Raises:
-        CubeError: The skin has the name of a cube, or pal_statistics_msgs is not installed.
+        CubeError: The skin has the same name as one of its cubes, or the package
+            pal_statistics_msgs is not installed.
     """
     component = node.value("hardware_name")
     if not component:
@@ -188,8 +189,8 @@ class StateInterfaces:
         self._frame_id = skin.parent_frame
         # The lock guards the wrenches. Two threads use them if the driver runs in this process.
         self._lock = threading.Lock()
-        # ros2_control derives the name of a component's node, with which the topics begin, from the
-        # name of the component by the same rule.
+        # The names of the topics begin with the name of the component's node, which ros2_control
+        # derives from the name of the component by this rule.
         topic = component.lower().replace("/", "_")
         kinds = [
             find_message_class(
