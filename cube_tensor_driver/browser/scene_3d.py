@@ -434,7 +434,7 @@ class Scene:
         return np.asarray(lines + scene.above(placement.poses, 1.1)[cube])
 
     def _draw_contacts(self, contacts: Sequence[Contact]) -> Array:
-        """Return the lines of a ring around each contact, which has the area of the contact."""
+        """Return the lines of a ring around each contact; the ring encloses the contact's area."""
         placement = self._placement
         rings = [np.zeros((0, 2, 3))]
         for contact in contacts:
