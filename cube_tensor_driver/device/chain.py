@@ -298,8 +298,9 @@ class LiveLinks:
             now_ns = self._read_clock()
             for read in received:
                 if self._was_clock_set:
-                    # The arrival may have been measured before the host's clock was set, and an
-                    # answer to TIME would compare host times before and after the step.
+                    # The arrival time may be from before the host's clock was set, so it is
+                    # replaced. An answer to TIME is not used, because it would compare host times
+                    # before and after the step.
                     read = read._replace(arrival_ns=now_ns, asked_ns=0)
                 # All rows are counted before any frame is handled, because an error in one frame
                 # loses the rows of all later ones.

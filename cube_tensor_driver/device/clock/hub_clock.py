@@ -80,7 +80,7 @@ class HubClock:
         self.problems: set[str] = set()
         self.line = ClockLine(self.track)
         self._step_us = 0  # suspected step of the hub's clock; 0 if none is
-        self._steps_ns: deque[int] = deque(maxlen=MAX_STEPS)  # arrivals after the newest steps
+        self._steps_ns: deque[int] = deque(maxlen=MAX_STEPS)  # arrival times of the newest steps
         self._doubtful_stamp = NEVER  # last stamp before a step was confirmed; may be too late
         self._restart()
 

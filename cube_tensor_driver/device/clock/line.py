@@ -163,10 +163,10 @@ class ClockLine:
             self.forget_round_trips()
         line = track.offset + track.drift * track.earliest_ns
         self._points.append((track.earliest_ns, line + height))
-        x, y = np.array(self._points).T  # device times and delays
+        x, y = np.array(self._points).T  # device times; arrivals minus device times
         if len(x) >= MIN_BUCKETS_FOR_DRIFT:
-            # The line joins the lowest points of the two halves. Which these are depends on its
-            # slope, so it takes a few buckets to become the edge of the hull.
+            # The line joins the lowest points of the two halves, as seen along its previous slope.
+            # Within a few buckets it converges to the edge of the hull.
             half = len(x) // 2
             heights = y - track.drift * x
             left = heights[:half].argmin()

@@ -68,7 +68,11 @@ class RowCounts:
         return lost
 
     def check(self, n_waiting: int) -> None:
-        """Update `unaccounted`, where `n_waiting` rows wait for the rest of their scan."""
+        """Update `unaccounted`, the number of received rows that have gone missing.
+
+        Args:
+            n_waiting: Number of rows that wait for the rest of their scan.
+        """
         self.unaccounted = self._count_missing(n_waiting)
 
     def _count_missing(self, n_waiting: int) -> int:

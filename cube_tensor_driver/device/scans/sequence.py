@@ -82,7 +82,8 @@ class SequenceTracker:
         first: Number of the first counted sample since the start or the last restart of the hub.
     """
 
-    # All attributes hold unwrapped numbers of samples, which continue where 32-bit ones wrap to 0.
+    # Numbers of samples are unwrapped in all attributes: they continue beyond 32 bits, where those
+    # of the hub wrap to 0.
 
     def __init__(self, track: LinkTrack | None = None) -> None:
         self.counters = SequenceCounters()
@@ -91,7 +92,7 @@ class SequenceTracker:
         self._is_begun = False
         self.first = 0
         self._first_us = 0
-        self._restart_at = -1  # number of the next sample when a restart was last expected
+        self._restart_at = -1  # number of the next sample at the last `expect_restart`
 
     def update(self, sequence: int, device_us: int) -> Arrival:
         """Classify one sample as new, late, duplicate or first after a restart, and count it.
