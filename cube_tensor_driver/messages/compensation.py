@@ -57,9 +57,9 @@ def encode_compensation(
 
 
 def read_motion(message: SkinCompensation, stamp_ns: int) -> Motion | None:
-    """Return the specific force over time that a SkinCompensation message contains.
+    """Return the motion (specific force and its gradient over time) in a SkinCompensation message.
 
-    It is None if the weight of the elastomer is not compensated.
+    The result is None if the weight of the elastomer is not compensated.
 
     Args:
         message: The message.
