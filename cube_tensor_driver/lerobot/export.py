@@ -199,7 +199,7 @@ def _find_stress(
     source: BagSource,
     choices: Choices,
 ) -> Iterator[tuple[Index, StressRows]]:
-    """Yield the reconstructed stress of the cubes of the skin, with the frame of each row.
+    """Yield the number of the frame of each row, and the rows with the reconstructed stress.
 
     Args:
         data_set: The data set, in which the calibrations are noted.
@@ -214,7 +214,7 @@ def _find_stress(
         if not len(known):
             continue
         ids = [one.id for one in settings[segment.number].calibrations]
-        # In most data sets, the calibrations are the same throughout.
+        # An entry is added only when the calibrations change, which is rare.
         if not noted or noted[-1]["ids"] != ids:
             since_ns = int(known.stamp_ns.min())
             noted.append(

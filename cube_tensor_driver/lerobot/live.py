@@ -184,7 +184,7 @@ class LiveWindows:
         self._thread.join()
         if self._writer is not None:
             self._writer.close()
-            # The file is closed together with the object.
+            # `close` has ended the stream. The file is closed when the writer is deleted.
             self._writer = None
 
     def _collect(self) -> None:

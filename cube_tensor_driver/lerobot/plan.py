@@ -189,7 +189,8 @@ def plan_bag(path: Path, choices: Choices) -> BagPlan:
                     range(first, first + n_frames),
                 )
             )
-            # Rounding up gives the first whole ns of each frame. A mark ends the last frame.
+            # Rounding up gives the first whole ns of each frame. The next mark ends the last frame
+            # of an episode.
             steps_ns = -(-np.arange(n_frames + 1) * SECOND // fps)
             edges = np.minimum(begin_ns + steps_ns, until_ns[mark])
             edges_ns = np.append(edges_ns, edges)
@@ -259,7 +260,7 @@ def _check_rate(plan: BagPlan, seconds: float, fps: int) -> None:
             "record longer"
         )
     rate = float(np.median(several)) / seconds
-    # The n samples of n - 1 periods are enough for n frames.
+    # The rate counts periods. The n samples that enclose n - 1 periods are enough for n frames.
     max_fps = math.floor(rate * (1 + 1 / several.min()))
     if fps > max_fps:
         raise BagError(
