@@ -1,17 +1,18 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Contact tracker: finds contacts in the traction on the surface, follows them from scan to scan.
+"""Contact tracker: finds contacts in the traction on the surface and follows them in every scan.
 
-In every scan (set of values of all cubes), the linear inverse gives the field of the pressure,
-whose connected regions are contacts (pressure_regions.py). The traction in each region is then
-fitted to the values of the cubes around it (tracked_region.py): as Hertz contacts, or as traction
-on nodes with a prior that is zero outside the region. Force, position, moment and area follow from
-this fit.
+In every scan (set of values of all cubes), the linear inverse problem (inverse.py) yields the field
+of the pressure on the whole skin. Its connected regions of large pressure are the regions of
+contact (pressure_regions.py). The traction in each region is then fitted to the values of the cubes
+around it (tracked_region.py): as Hertz contacts, or as traction on nodes (small contacts on a grid)
+with a prior that is zero outside the region. Force, position, moment and area of each contact
+follow from this fit.
 
-Fits take a few milliseconds, so the work of a scan is limited, and what does not fit is done in the
-next scans. A Hertz contact that moves needs one Gauss-Newton step a scan, and a fit on nodes only a
-product. A region that has no fit yet is reported with the integrals of the field, which are less
-exact.
+Fits take a few milliseconds, so the work in a scan is limited, and the remaining work is done in
+the next scans. Once they are fitted, Hertz contacts that move need one Gauss-Newton step per scan,
+and a fit on nodes only needs matrix products. A region that has no fit yet is reported with the
+integrals of the field, which are less exact.
 """
 
 from __future__ import annotations
@@ -45,11 +46,12 @@ MAX_REGIONS = 32
 """Largest number of regions of contact on one skin; those with the largest pressure are kept."""
 
 MAX_WORK_PER_SCAN = 14.0
-"""Computing work in one scan (set of values of all cubes), in ms (`WORK_MS`), up to which further
-steps of fits are made; the remaining steps are made in the next scans. One step is always made."""
+"""Largest computing time of the steps of fits in one scan (set of values of all cubes), in ms, as
+estimated by `WORK_MS`. The remaining steps are made in the next scans; one step is always made."""
 
 TRACKING_WORK_MS = 0.25
-"""CPU time in ms that it takes to compute a fit for the values of the next scan."""
+"""CPU time, in ms for each region and scan, of the computation of the present fit for the newest
+values. It is subtracted from `MAX_WORK_PER_SCAN`, before fits are made or improved."""
 
 MATCH_PITCHES = 1.0
 """Largest distance that a contact moves between two scans, divided by the pitch (distance of
@@ -144,8 +146,9 @@ class ContactTracker:
 
         Args:
             values: Components (cubes, 15) in Pa and Pa/m, NaN where unknown.
-            certain: Smallest pressure (M,), in Pa at the depth of the cubes, that is certain to be
-                a contact, below each point of the surface; None: 0.
+            certain: Pressure (M,), in Pa at the depth of the cubes below each point of the surface,
+                that a new contact must exceed, because errors of the values may cause smaller ones;
+                None: 0.
             max_work: Computing work in ms (`MAX_WORK_PER_SCAN`). 0: no fit is made or improved.
                 Infinite: all fits are improved as far as possible.
 
@@ -210,8 +213,8 @@ class ContactTracker:
     def deviation(self, values: Array) -> FieldDeviation:
         """Compute the standard deviations of `field`.
 
-        Each variance is the sum of that of the residual field (traction that the fits do not
-        explain) and that of the fits.
+        Each variance is the sum of two variances: that of the residual field (traction that the
+        fits do not explain) and that of the traction of the fits.
 
         Args:
             values: Components (cubes, 15) in Pa and Pa/m that the last `update` was called with.
@@ -246,7 +249,7 @@ class ContactTracker:
         Args:
             pressure: Pressure (M,) in Pa at the depth of the cubes' centres, below each of the M
                 points of the surface.
-            certain: Smallest pressure (M,), in Pa, that is certain to be a contact; None: 0.
+            certain: Pressure (M,) in Pa that a new contact must exceed, as for `update`.
         """
         found = self._pressure_regions.find(pressure, certain)[:MAX_REGIONS]
         owner = np.full(len(pressure), len(self._regions))
@@ -301,7 +304,8 @@ class ContactTracker:
     def _update_fits(self) -> None:
         """Compute all fits for the newest values.
 
-        The response of the cubes to the other regions is subtracted from their values before.
+        In the fit of a region, the response of the cubes to all other regions is subtracted from
+        their values first.
         """
         fitted = self._fitted
         hertz_fits = [fit for fit in self._fits if isinstance(fit, HertzFit)]
@@ -365,9 +369,10 @@ class ContactTracker:
     def _integrate_field(self, field: TractionField) -> None:
         """Estimate the contacts of regions without a fit by integrals of the traction field.
 
-        The normal force is the integral of the pressure at the depth of the cubes, which equals
-        that on the surface, but is blurred beyond the region. So the integrals take in all points
-        around a region, and those around several regions are shared among them.
+        The normal force is the integral of the pressure at the depth of the cubes, which equals the
+        integral on the surface. At this depth, the pressure spreads beyond the region. So the
+        integrals include all points around it; points around several regions are divided equally
+        among these regions.
         """
         inverse = self._inverse
         around = [self._pressure_regions.find_around(one.points) for one in self._regions]
@@ -406,10 +411,12 @@ class ContactTracker:
         traction = np.einsum("nba,nb->na", from_home, field.traction[own])
         force = weight @ traction
         force[2] = -normal_force
-        # A shear force tilts the pressure: it shifts its centre at a depth, in proportion to this.
+        # A shear force shifts the centre of pressure at a depth, by the depth times the ratio of
+        # shear and normal force.
         moments = pressing @ unroll_points(inverse, region.home, own) - inverse.depth * force[:2]
         area = len(region.points) * inverse.area
-        # An error changes the pressure at all points together.
+        # The errors of the pressure at all points have the same causes, so their deviations (not
+        # their variances) add up.
         error = float(weight @ inverse.error_deviation[own])
         error_share = error / max(normal_force, 1e-12)
         radius = np.sqrt(weight.sum() / np.pi)

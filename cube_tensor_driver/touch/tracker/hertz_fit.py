@@ -258,7 +258,7 @@ class HertzFit:
     @property
     def score(self) -> float:
         """-2 ln of the evidence (probability of the values, in Laplace approximation), up to a
-        constant that is the same for `Posterior.score` of a fit of the traction on nodes."""
+        constant that is the same for `NodeFit.score` of a fit of the traction on nodes."""
         _, log_posterior_precision = np.linalg.slogdet(self.linear.information)
         log_prior_precision = np.log(self.linear.precision).sum()
         occam_term = log_posterior_precision - log_prior_precision

@@ -62,9 +62,10 @@ class CubeNoise:
     def update(self, scaled: Array, cubes: Index) -> None:
         """Compute the noise of cubes again if it has changed.
 
-        The noise of a cube has changed if other pads are in use or other components are known (not
-        NaN) than at the last update. It has also changed if its stress makes the variance of a
-        pad's error differ by more than the factor `MAX_NOISE_CHANGE`.
+        The noise of a cube has changed if other pads are in use, other components are known (not
+        NaN) or other errors are stated (`SurfaceInverse.state_errors`) than at the last update. It
+        has also changed if its stress makes the variance of a pad's error differ by more than the
+        factor `MAX_NOISE_CHANGE`.
 
         Args:
             scaled: Components of stress and gradient (times d0, half the side of a cube), in Pa
@@ -74,7 +75,8 @@ class CubeNoise:
         self.scaled = scaled
         inverse = self._inverse
         if self._revision != inverse.revision:
-            # The set of pads in use has changed, so all stored variances are invalid (0).
+            # The pads in use or the stated errors have changed, so all stored variances are invalid.
+            # The value 0 marks them as such.
             self._revision = inverse.revision
             self._variance[:] = 0.0
         values = scaled[cubes]

@@ -2,11 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Posterior of the traction in one region of contact, from the values of the cubes around it.
 
-The traction is different from zero only in the region, which the field of the inverse problem shows
-(pressure_regions.py). This knowledge makes integrals over the region far more exact than those of
-the field, whose prior is the same everywhere. The traction is the sum of small Hertz contacts on a
-grid of nodes. Let f be the forces of the nodes in N, B the whitened response of the cubes to them,
-w the whitened values and e their noise. The posterior is that of a Gaussian process::
+The traction is different from zero only in the region, which is known from the pressure field of
+the linear inverse problem (pressure_regions.py). This knowledge makes integrals over the region far
+more exact than integrals of the field, whose prior is the same everywhere. The traction is the sum
+of small Hertz contacts on a grid of nodes. Let f be the forces of the nodes in N, B the whitened
+response of the cubes to them, w the whitened values and e their noise. The posterior is that of a
+Gaussian process::
 
     w = B f + e,    f ~ N(0, s^2 K),    e ~ N(0, t)
     mean f = s^2 K B' W w,    covariance t (s^2 K - s^4 K B' W B K),    W = (1 + s^2 B K B')^-1
@@ -115,8 +116,9 @@ _RELATIVE_DEVIATIONS = np.array([SHEAR_RATIO, SHEAR_RATIO, 1.0])
 
 
 MIN_SIGNAL_TO_NOISE = 1e-4
-"""Smallest ratio of prior variance to noise of a combination of forces that values still change.
-The others keep their prior mean, 0, and variance, which saves half of the computing time."""
+"""Smallest ratio of prior variance to noise variance with which a combination of the nodes' forces
+is estimated from the values. Combinations with a smaller ratio keep their prior mean, 0, which
+saves half of the computing time."""
 
 
 class NodePosterior(NamedTuple):
@@ -131,9 +133,10 @@ class NodePosterior(NamedTuple):
         shrinkage: Variance (k,) of each unknown after the values are known; 1 before.
         to_forces: Matrix (3 q, k) from the unknowns to the forces of the nodes in N: along x of all
             nodes, then along y, then along z.
-        to_errors: Matrix (S - 1, N) from the values to the errors of the properties of the
-            elastomer except the depth, in standard deviations.
-        by_errors: Change (k, S - 1) of `response` times values by these errors.
+        to_errors: Matrix (S - 1, N) from the values to the errors of the S properties of the
+            elastomer (sensitivity.py) except the depth, in standard deviations.
+        by_errors: Change (k, S - 1) of the product of `response` and the values for one standard
+            deviation of each of these errors.
         root: Square root (3, q, 3 q + S) of the covariance of the forces, in N.
         occam_term: Part of -2 ln of the evidence that does not depend on the values.
     """
@@ -232,7 +235,7 @@ class NodeFit:
         self.is_sharp = False
 
     def settle(self, white: Array) -> None:
-        """Include errors of the elastomer, and find the contacts.
+        """Compute the posterior with errors of the elastomer, and divide the region into contacts.
 
         Args:
             white: Whitened values (n C,), as for `solve`.
@@ -405,8 +408,9 @@ class NodeFit:
 
     @property
     def _envelope(self) -> Array:
-        """Prior standard deviations (q,) of the nodes for the next `solve`, divided by the largest
-        one: those of the present forces, smoothed over neighbouring nodes."""
+        """Prior standard deviations (q,) of the nodes' forces for `sharpen`, divided by the largest
+        one. Their squares are the expected squares of the normal forces in the present posterior,
+        smoothed over neighbouring nodes."""
         normal_variance = self.misfit * (self.posterior.root[2] ** 2).sum(axis=1)
         mean_square = self.forces[2] ** 2 + normal_variance
         smoothing = np.exp(-self._squared_distances / (2 * self.spacing**2))
@@ -441,8 +445,8 @@ class NodeFit:
     def _decompose(self, envelope: Array) -> tuple[Array, Array, Array]:
         """Compute the eigenvalues and eigenvectors from which every posterior follows.
 
-        The unknowns are combinations of the forces with independent priors of variance 1. D is the
-        design matrix (n C, 3 q), the whitened values under each of them.
+        The forces are combinations of 3 q unknowns with independent priors of variance 1. The
+        design matrix D (n C, 3 q) contains the whitened values that each unknown causes.
 
         Args:
             envelope: Prior standard deviation (q,) of the force of each of q nodes, divided by the

@@ -73,8 +73,8 @@ class PressureRegions:
 
         Args:
             pressure: Pressure (M,) in Pa at the depth of the cubes, below all points.
-            certain: Smallest pressure (M,), in Pa, that is certain to be a contact, below each
-                point; None: 0 at all points.
+            certain: Pressure (M,) in Pa that must be exceeded below each point in a new region,
+                because errors of the values may cause smaller pressures; None: 0 at all points.
 
         Returns:
             Indices of the points of each region, the region with the largest pressure first.
@@ -94,7 +94,7 @@ class PressureRegions:
         )
 
     def find_around(self, points: Index) -> Index:
-        """Return the indices of all points within `JOIN_PITCHES` of some points, with these."""
+        """Return the indices of some points, and of all points within `JOIN_PITCHES` of them."""
         around = np.unique(self._wide_neighbours[points])
         return np.asarray(around[around < len(self._inside)])
 

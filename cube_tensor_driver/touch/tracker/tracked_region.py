@@ -119,11 +119,13 @@ change it by 3 % each (sensitivity.py). With the value 1 % and an error of Poiss
 forces of fourteen contacts were off by 2.2 stated deviations."""
 
 MAX_STEPS = 10
-"""Largest number of Gauss-Newton steps in the first fit of a Hertz contact."""
+"""Largest number of Gauss-Newton steps in the first fit of Hertz contacts. Later, it is the largest
+number of additional steps in one scan (set of values of all cubes)."""
 
 HOPELESS = 4.0
-"""Misfit after half of the steps, divided by the largest misfit with which a fit of a Hertz contact
-is kept, above which the other half is not made."""
+"""Misfit (chi-squared per known value) of the first fit of a Hertz contact after half of its
+`MAX_STEPS` steps, divided by the largest misfit with which the fit is kept, above which the fit is
+given up without the other half."""
 
 Respond = Callable[[Index], tuple[Array, Array]]
 """Function that takes the indices of n cubes and returns the response of all cubes of the skin to
@@ -136,8 +138,8 @@ class Work(IntEnum):
 
     MOVE makes a Gauss-Newton step of Hertz contacts. BEGIN makes the first fit of a Hertz contact.
     PREPARE places nodes (small contacts on a grid); SOLVE and SETTLE fit the traction on them.
-    CHOOSE tries Hertz contacts in its place. RENEW solves again for the same nodes. SHARPEN repeats
-    the fit with a narrower prior. NONE stands for a fit that needs no step.
+    CHOOSE tries Hertz contacts instead of nodes. RENEW solves again for the same nodes. SHARPEN
+    repeats the fit with a narrower prior. NONE stands for a fit that needs no step.
     """
 
     MOVE = 0
@@ -317,7 +319,7 @@ class TrackedRegion:
         return LocalValues(self._inverse, self._noise, home, facing)
 
     def _whiten_newest(self, values: LocalValues) -> Array:
-        """Return `_whiten` with the newest noise of the cubes and response to other regions."""
+        """Compute noise and response to other regions for the newest values, return `_whiten`."""
         self._noise.update(self._noise.scaled, values.cubes)
         self.subtract_others(values, *self._respond(values.cubes))
         values.refresh()
@@ -332,8 +334,8 @@ class TrackedRegion:
     def is_refined(self) -> bool:
         """Whether all regions near are fitted, and the fit agrees with the newest values.
 
-        It does not if its misfit has grown, or if it is still to be solved for the newest response
-        to other regions.
+        The fit does not agree if its misfit has grown, or if it must be repeated or finished first,
+        for example because the response to other regions has changed.
         """
         if not self.has_fitted_neighbours or self._is_misfit_larger:
             return False
@@ -567,7 +569,7 @@ class TrackedRegion:
                 return
 
     def _solve_nodes(self) -> None:
-        """Fit the traction on nodes that are prepared, or again on those of the present fit."""
+        """Fit the traction on the prepared nodes, or else on those of the present fit again."""
         self._is_tried = True
         fit = self._prepared or copy(self.fit)
         self._prepared = None
@@ -601,8 +603,8 @@ class TrackedRegion:
         discs = discs._replace(log_sizes=log_sizes)
         fit = HertzFit(self._inverse, nodes.values, discs)
         self._iterate(fit, MAX_STEPS)
-        # The evidence of all cubes can hide a misfit of the nearest cubes, so it is tested apart.
-        # If there are other regions, their contacts may cause this misfit, and it is ignored.
+        # The evidence of all cubes can hide a misfit of the nearest cubes, which is therefore tested,
+        # too. If there are other regions, their contacts may cause this misfit, and it is ignored.
         is_round = fit.shape_misfit < MAX_HERTZ_MISFIT or np.isfinite(self.gap)
         if is_round and not fit.is_unsettled and fit.score < nodes.score:
             self._accept(fit)
