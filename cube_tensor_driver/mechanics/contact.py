@@ -267,8 +267,8 @@ def _compute_airy(
 
     C is the part of the stress that depends on Poisson's ratio. It consists of derivatives of the
     potentials chi, chi_Z = ln(R + Z) and chi_ZZ = 1/R. In a plane Z = const, each potential is a
-    function h of r^2 = x^2 + y^2. With the complex position c = x + i y and its conjugate c*, its
-    derivatives follow from those of h1 = h'/r, h2 = h1'/r and so on::
+    function h of r^2 = x^2 + y^2. With the complex position c = x + i y and its conjugate c*, the
+    derivatives of h consist of the functions h1 = h'/r, h2 = h1'/r and so on::
 
         dh/dc = c* h1 / 2,     dh1/dc = c* h2 / 2,     dr^2/dc = c*,     4 d^2/(dc dc*) = Laplace
 
@@ -313,10 +313,12 @@ def _compute_airy(
         """Return trace T and deviator D of the second derivatives of g, or their derivatives by Z.
 
         Args:
-            t2: h2 for tangential forces, of h = chi; for the derivative by Z, of h = chi_Z.
-            t3: h3 of the same h.
-            n1: h1 for normal forces, of h = chi_Z; for the derivative by Z, of h = chi_ZZ.
-            n2: h2 of the same h.
+            t2: Function h2 in the terms of tangential forces: that of h = chi, or that of
+                h = chi_Z for the derivatives by Z.
+            t3: Function h3 of the same h.
+            n1: Function h1 in the terms of normal forces: that of h = chi_Z, or that of h = chi_ZZ
+                for the derivatives by Z.
+            n2: Function h2 of the same h.
         """
         trace = f_dot_d * (4 * t2 + r_square * t3) - fz * (2 * n1 + r_square * n2)
         deviator = 2 * force * position * t2 + position**2 * (f_dot_d * t3 - fz * n2)
@@ -324,7 +326,7 @@ def _compute_airy(
 
     trace, deviator = differentiate_twice(chi2, chi3, log1, log2)
     trace_z, deviator_z = differentiate_twice(log2, log3, inv1, inv2)
-    # These are dT/dc = dD/dc* and dD/dc.
+    # `mixed` becomes dT/dc, which equals dD/dc*; `pure` becomes dD/dc.
     tangential = f_dot_d * (3 * chi3 + r_square / 2 * chi4)
     normal = fz * (2 * log2 + r_square / 2 * log3)
     mixed = force / 2 * (4 * chi2 + r_square * chi3) + position * (tangential - normal)

@@ -40,8 +40,8 @@ _TABLES = ("positions", "normals", "place", "pads")
 and normals of the pads, positions of the forces, and the stresses of the pads."""
 
 _PARSE_ERRORS = (OSError, KeyError, TypeError, ValueError)
-"""Errors of a file of influence functions that cannot be read, lacks an array, or has an array of
-another type or shape."""
+"""Exceptions that are raised if a file of influence functions cannot be read, lacks an array, or
+has an array of another type or shape."""
 
 
 @dataclass(frozen=True, eq=False)
