@@ -594,9 +594,8 @@ def _advise(
                 "give them as fixed, or choose a larger symmetry"
             )
             break
-        # The advice names the coefficients that the best load determines. If there are none,
-        # because it determines some only together with the next load, it names all undetermined
-        # ones.
+        # The advice names the coefficients that the best load determines. If it determines some
+        # only together with the next load, the advice names all undetermined ones.
         settled = names[is_open & ~new_open]
         subject = settled if len(settled) else names[is_open]
         name = model.structure.modes.names[mode]
