@@ -129,7 +129,7 @@ class Calibration:
         """Return an attribute of `PAD_QUANTITIES` as a read-only array (P,).
 
         Raises:
-            CalibrationError: The shape is wrong, or a value is negative or 0.
+            CalibrationError: The shape is wrong, or a value is negative, or it is 0 and not a beta.
         """
         n_pads = self.layout.n_pads
         array = read_numbers(getattr(self, name), name, CalibrationError)

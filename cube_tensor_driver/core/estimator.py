@@ -213,7 +213,7 @@ def make_estimator(
     covariance[~observed] = np.nan
     covariance[:, ~observed] = np.nan
     # The residual is the part of the pad stresses that is orthogonal to the response of every mode
-    # (linear stress field). Only noise and faults cause it.
+    # (linear stress field). Noise, faults and stress fields that are not linear cause it.
     n_present = len(present)
     explained = multiply(seen, seen.T)
     unexplained = np.eye(n_present) - explained

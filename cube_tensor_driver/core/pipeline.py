@@ -87,7 +87,7 @@ def _find_estimator(calibration: Calibration, mask: int) -> Estimator:
     """Return the estimator (map from pad stresses to components) of a calibration.
 
     It is cached for all pipelines of the process, because making it takes longer than computing the
-    stress of a recording of a second.
+    stress from the data of one second.
 
     Args:
         calibration: The calibration.
@@ -324,7 +324,7 @@ class Pipeline:
             row, request = run(row, task)
             if request == UNKNOWN_CUBE:
                 if watch:
-                    raise self._compute_misfit(rows)
+                    raise self._make_layout_error(rows)
                 _fill_unknown(out, rows, row)
                 row += 1
             elif request == NEEDS_WINDOW and watch:
@@ -446,7 +446,7 @@ class Pipeline:
                 frequency = frequency.astype(self.dtype)
         frequency = np.ascontiguousarray(frequency)
         if frequency.shape != (len(rows), self.n_pads):
-            raise self._compute_misfit(rows)
+            raise self._make_layout_error(rows)
         force = rows.specific_force
         cube = rows.cube
         if cube.dtype != np.uint16:
@@ -463,8 +463,8 @@ class Pipeline:
             None if force is None else np.ascontiguousarray(force, self.dtype),
         )
 
-    def _compute_misfit(self, rows: FrequencyRows) -> LayoutError:
-        """Return the error for rows that do not fit the skin."""
+    def _make_layout_error(self, rows: FrequencyRows) -> LayoutError:
+        """Return the error for rows with other cubes, or more or fewer pads, than the skin has."""
         return LayoutError(
             f"pipeline: frequencies of shape {rows.frequency.shape} for {len(rows)} rows of cubes "
             f"up to {max(rows.cube, default=0)}; this skin has {len(self.calibrations)} cubes and "

@@ -110,7 +110,7 @@ class Compensation:
         )
 
     def step(self, columns: Columns, row: int) -> None:
-        """Compute creep and the effect of temperature for the step of `STEP_NS` from a scan on.
+        """Compute creep and the effect of temperature for a step (`STEP_NS`) that begins at a scan.
 
         Args:
             columns: Rows of frequencies.
@@ -204,9 +204,10 @@ class Compensation:
             self._fill_offsets()
 
     def _collect_parts(self, effect: Thermal | Creep) -> list[Array]:
-        """Return the arrays of the state of an effect. To restore a state, write into them.
+        """Return the arrays that hold the state of an effect, which later rows need.
 
-        The bits of times (int64) are viewed as float64, because a conversion would round them.
+        Writing into them changes the state. Times (int64) are returned as views of type float64
+        with the same bits, because a conversion would round them.
         """
         offsets = self.offsets
         return [

@@ -232,7 +232,10 @@ class Creep:
         return bool(shift.any())
 
     def parts(self) -> list[Array]:
-        """Return the arrays of the state. To restore a recorded state, write into them."""
+        """Return the arrays that hold all that later rows need of the earlier ones (the state).
+
+        To restore a recorded state, write into them and call `resume`.
+        """
         return [
             self._newest.reading,
             self._time_ns.view(float),

@@ -184,7 +184,10 @@ class Thermal:
         return np.concatenate([size[cubes] * by[:, None] for size, by in by_cause], axis=2)
 
     def parts(self) -> list[Array]:
-        """Return the arrays of the state. To restore a recorded state, write into them."""
+        """Return the arrays that hold all that later rows need of the earlier ones (the state).
+
+        To restore a recorded state, write into them and call `resume`.
+        """
         return [
             self._time_ns.view(float),
             self._measured,
@@ -194,10 +197,12 @@ class Thermal:
 
 
 def filter_weights(lag: Array) -> Array:
-    """Return weights (L,) with which L parallel low-pass filters add up to the filters in series.
+    """Return the weights (L,) that make parallel low-pass filters equal to the filters in series.
+
+    The sum of weight × output over the L parallel filters is the output of the series.
 
     Args:
-        lag: Time constants (L,), in s, all different.
+        lag: Time constants of the filters (L,), in s, all different.
     """
     difference = lag[:, None] - lag
     np.fill_diagonal(difference, lag)

@@ -83,7 +83,7 @@ class DriftTracker:
         self._unloaded_windows = np.zeros(n_cubes, int)
         self._windows = 0
         # Rest frequencies at the last tare. Then, for each cube: the number of windows since the
-        # tare in which it was unloaded, and the number of windows for which it has been loaded now.
+        # tare in which it was unloaded, and the number of windows since it was last unloaded.
         self._tared_rest = self._rest_in_use
         self._followed_windows = np.zeros(n_cubes, int)
         self._loaded_windows = np.zeros(n_cubes, int)

@@ -58,7 +58,7 @@ def run(start: int, task: Task) -> tuple[int, int]:
     n_rows = len(cube)
     if len(unknown):
         n_rows = start + int(unknown[0])
-    # A scan begins where the cube number does not rise.
+    # A scan begins at each row whose cube number is not larger than that of the row before.
     begins_scan = np.ones(len(cube) + 1, bool)
     begins_scan[1:-1] = cube[1:] <= cube[:-1]
     while start < n_rows:
@@ -265,9 +265,9 @@ def _find_offsets(
     """Return what is subtracted from rows of one scan (N, P), by the equation of `Offsets`.
 
     Args:
-        offsets: What is subtracted; the state of the cubes is changed.
+        offsets: Creep, temperature and weight; the newest rows of the cubes are stored in it.
         rows: Rows of one scan.
-        cube: Numbers of their cubes, to index with.
+        cube: Numbers of the cubes of the rows, as an index into tables of cubes.
         v: Pad stress / stiffness by the pad law (N, P).
         is_bad: Whether a pad is not used (N, P).
         status: Status bits of the rows (N,), to which those of the compensation are added.
@@ -334,7 +334,7 @@ def find_impossible(
         tables: Tables of the skin.
         health: State of the health, with the possible range of frequencies.
         rows: N rows of one scan.
-        cube: Numbers of their cubes, to index with.
+        cube: Numbers of the cubes of the rows, as an index into tables of cubes.
 
     Returns:
         Whether the frequency of a pad is impossible, and whether the device reports it (N, P).
