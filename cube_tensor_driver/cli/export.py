@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from ..lerobot.export import Exported
 
 UNUSUAL_DEPTH = 2
-"""Largest number of samples in any frame, divided by the usual number, above which a warning is
-printed.
+"""Ratio of the largest to the usual number of samples in a frame above which a warning is printed.
 
 A frame is one time step of a LeRobot data set. All frames are stored with the size of the largest
 one, so a single frame with unusually many samples enlarges the whole data set.

@@ -115,7 +115,7 @@ def write_result(path: Path, calibration: Calibration, words: str) -> None:
     Args:
         path: The file.
         calibration: The result of a fit.
-        words: The words behind ./cube fit, which the header of the file states.
+        words: Arguments of ./cube fit, which the header of the file contains.
     """
     from ..config.calibration import write_calibration
 

@@ -31,7 +31,7 @@ def add_arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Show what a layout's pads measure: ranks, unobservable modes."""
+    """Show what the pads of a layout can measure, in numbers and as a picture."""
     from ..config.calibration import (
         find_calibration,
         find_named_layout,
