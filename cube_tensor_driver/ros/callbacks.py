@@ -39,8 +39,8 @@ def guard(
 
     Args:
         callback: Callback of a subscription, a timer or a service.
-        on_error: Called with an exception of the callback, and with its arguments; its result is
-            returned in place of that of the callback.
+        on_error: Called with the exception and with the arguments of the callback. The result of
+            `on_error` is returned in place of that of the callback.
         errors: Class of the exceptions; others are not caught.
     """
 

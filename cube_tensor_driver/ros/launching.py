@@ -118,7 +118,8 @@ class SkinArguments(NamedTuple):
         config: Absolute path of the skin file.
         skin: Content of the skin file.
         load: Path of the load script, for simulated hubs.
-        imperfections: Path of the deviations of simulated pads; None: they have none.
+        imperfections: Path of the file with the deviations of simulated pads from ideal ones; None:
+            the pads are ideal.
         parameters: Name of a ROS parameter -> its value, for the arguments that set parameters of
             `driver` and `reconstruction`. Empty arguments are left out, so that a value that an
             including launch file sets with SetParameter is kept.
@@ -134,7 +135,7 @@ class SkinArguments(NamedTuple):
 
 
 def write_parameter_file(parameters: dict[str, Value]) -> str:
-    """Write a parameter file of ROS, which is temporary, and return its path.
+    """Write a temporary parameter file of ROS, and return its path.
 
     Args:
         parameters: Name of a parameter of a node -> its value.
@@ -145,7 +146,7 @@ def write_parameter_file(parameters: dict[str, Value]) -> str:
 
 
 def write_rviz_file(skin: Skin) -> str:
-    """Write a configuration file of RViz for a skin, which is temporary, and return its path."""
+    """Write a temporary configuration file of RViz for a skin, and return its path."""
     path = make_temporary_folder("cube_rviz_") / "skin.rviz"
     write_yaml(path, make_rviz_view(skin))
     return str(path)

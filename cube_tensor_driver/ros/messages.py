@@ -183,7 +183,7 @@ def pack_array(code: str, values: AnyArray) -> array[Any]:
 
 
 def to_time(stamp_ns: int) -> Time:
-    """Convert a time in ns since the Unix epoch to a message."""
+    """Convert a time in ns since the Unix epoch to a message builtin_interfaces/Time."""
     return Time(sec=stamp_ns // SECOND, nanosec=stamp_ns % SECOND)
 
 

@@ -36,8 +36,8 @@ MIN_BATCH_DEPTH = 10
 ROW_BYTES = 78
 """Size of a row (the stress of one cube at one instant) in a message of `stress`, in bytes.
 
-The sizes of the queues of all batch topics are computed with it. For `frequencies` the result is
-too large rather than too small, because its row of a cube with 8 pads is smaller.
+The depths of the queues of all batch topics are computed with it. A row of `frequencies` of a cube
+with 8 pads is smaller, so the queue of that topic stays below `MAX_QUEUE_BYTES`.
 """
 
 DEFAULT_RATE_HZ = 1000.0
