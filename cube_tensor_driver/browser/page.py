@@ -57,7 +57,8 @@ INCLINED = "inclined"
 
 CAMERA_DIRECTIONS = {
     INCLINED: CAMERA_POSITION - CAMERA_TARGET,
-    # Exactly from above, it would not be known which side of the skin is up in the picture.
+    # If the camera were exactly above the skin, it would be undefined which side of the skin is
+    # up in the picture.
     "from above": np.array([0.0, -0.01, 1.4]) * SPAN,
 }
 """Name of a direction of view -> vector (3,), in the coordinates of the scene. It leads from the
@@ -217,7 +218,12 @@ class Page:
                         setattr(self._objects[name], key, value)
 
     def _read_settings(self, history: History, status: PageStatus) -> ViewSettings:
-        """Return what the user has chosen, as the browser has reported it."""
+        """Return what the user has chosen, as the browser has reported it.
+
+        Args:
+            history: Values of all cubes in the last seconds, which the charts draw.
+            status: States whether a bag is being recorded.
+        """
         quantity = self._colours.quantity
         if quantity is not self._quantity:
             # The old range is that of another quantity, so the automatic range starts anew.

@@ -126,9 +126,13 @@ class FieldModel:
         return SurfaceField(between.pressure, shear, "between the cubes, at their depth")
 
     def _interpolate(self, points: Array, columns: Array) -> Array:
-        """Interpolate C quantities, given at M points (M, C), to the points of the surface.
+        """Interpolate C quantities to the N points of the surface, (N, C).
 
         The result is NaN where one of the nearest values is NaN.
+
+        Args:
+            points: Points (M, 3), in m, at which the quantities are known.
+            columns: Values of the quantities at these points, (M, C).
         """
         # The points of a skin do not move, so the weights of the interpolation are computed once.
         if not np.array_equal(points, self._points):
