@@ -22,13 +22,13 @@ from ..track import MAX_DEVICE_US, NEVER, LinkTrack
 from .line import MAX_DELAY_NS, ClockLine
 
 MAX_PAUSE_NS = 60_000_000_000
-"""Longest pause between samples, in ns, after which the line is continued. If the pause is longer
-by both clocks, a new line is begun, because the error of the drift, up to 6 ms per minute, would
-look like a step."""
+"""Longest pause between samples, in ns, after which the clock line (host time over device time) is
+continued. If both clocks show a longer pause, a new line is begun, because the error of the drift,
+up to 6 ms per minute, would look like a step."""
 MIN_STEP_US = 4000.0
-"""Smallest deviation, in µs, of the device time between two samples from the sample periods between
-their numbers, at which a step of the hub's clock is suspected. Steps of 5 ms shall be found; 1 ms
-is left for the jitter of the hub."""
+"""Smallest deviation, in µs, at which a step of the hub's clock is suspected: of the device time
+between two samples from the number of sample periods between them times the period. Steps of 5 ms
+shall be found; 1 ms is left for the jitter of the hub."""
 PERIOD_SAMPLES = 64
 """Time constant, in samples, of the low-pass filter that estimates the sample period."""
 DECISION_NS = 200_000_000
@@ -38,13 +38,14 @@ MIN_DECISION_READS = 8
 """Number of reads of the link after a suspected step before `DECISION_NS` applies. The delays of
 fewer reads may all be long."""
 UNLIKELY_DELAY = 16.0
-"""Ratio of a suspected step to the mean delay above which one delay suffices to decide about the
-step. The delay is compared with half of the step, and hardly any delay is 8 times the mean."""
+"""Ratio of a suspected step of the hub's clock to the mean delay above which one delay suffices to
+decide about the step. The delay is compared with half of the step, and hardly any delay is 8 times
+the mean."""
 MAX_STEPS = 3
-"""Number of steps within `STEPS_NS` at which a hub's clock is not used any more, and arrival times
-are used as stamps."""
+"""Number of steps of a hub's clock within `STEPS_NS` from which on the clock is not used, and
+arrival times are used as stamps."""
 STEPS_NS = 10_000_000_000
-"""Length, in ns, of the time window in which steps are counted."""
+"""Length, in ns, of the time window in which steps of a hub's clock are counted."""
 MAX_BAD_ANSWERS = 3
 """Number of successive answers to TIME (request for the hub's device time) that contradict the
 samples or earlier answers, at which a problem is reported and the earlier answers are forgotten."""
@@ -187,7 +188,13 @@ class HubClock:
         self._steps_ns.append(self.track.last_arrival_ns)
 
     def _find_step(self, number: int, device_us: int) -> int:
-        """Compare a device time with the reference, an earlier sample, and the sample period.
+        """Compare a device time with that of an earlier sample (reference) and the sample period.
+
+        The sample then becomes the reference, and the estimate of the sample period is updated.
+
+        Args:
+            number: Number of the sample.
+            device_us: Device time of the sample, in µs.
 
         Returns:
             Deviation of the device time, in µs, if it may be a step of the hub's clock; else 0.
@@ -283,7 +290,13 @@ class HubClock:
         return not problem
 
     def _convert(self, times: Sequence[int], arrival_ns: int, is_late: bool) -> list[int]:
-        """Fit the line to samples that arrived together, and return their stamps."""
+        """Fit the line to samples without a step between them, and return their stamps.
+
+        Args:
+            times: Device times of samples that arrived together, in µs.
+            arrival_ns: Host time at which they arrived.
+            is_late: Whether this host is too slow and reads the samples late.
+        """
         if not times:
             return []
         track = self.track

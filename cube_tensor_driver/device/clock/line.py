@@ -23,8 +23,8 @@ import numpy as np
 from ..track import LinkTrack
 
 BUCKET_NS = 1_000_000_000
-"""Length, in ns, of the time intervals (buckets) of which each gives the line one point: the sample
-with the smallest delay."""
+"""Length, in ns, of the time intervals (buckets) of which each gives the clock line (host time over
+device time) one point: the sample with the smallest delay."""
 MAX_BUCKETS = 120
 """Maximum number of points to which the clock line (host time over device time) is fitted. They are
 the points of the newest buckets: two minutes, with one point per second."""
@@ -39,18 +39,18 @@ MAX_DRIFT = 1e-3
 """Largest credible drift, to which the fitted drift is limited. A larger one is found when the host
 pauses and reads many samples late."""
 MAX_RISE_NS = 20e6
-"""Largest credible rise, in ns, of a bucket's smallest delay above the fitted line; USB adapters
-delay samples by up to 16 ms. If the rises of two successive buckets are larger, a clock was set; a
-single larger one may come from a pause of the host."""
+"""Largest credible rise, in ns, of the smallest delay in a bucket (1 s) above the clock line; USB
+adapters delay samples by up to 16 ms. If the rises of two successive buckets are larger, a clock
+was set; a single larger one may come from a pause of the host."""
 MAX_FALL_NS = 4e6
-"""Largest credible fall, in ns, of a bucket's smallest delay below the fitted line. After a larger
-fall, a clock was set. Steps of 5 ms shall be found."""
+"""Largest credible fall, in ns, of the smallest delay in a bucket (1 s) below the clock line. A
+larger fall means that a clock was set. Steps of 5 ms shall be found."""
 MAX_DELAY_NS = 60_000_000_000
 """Longest credible delay between sampling and arrival, in ns. If the line gives a longer one, the
 arrival time is used as the stamp."""
 JITTER_POINTS = 64
 """Time constant, in reads of the link, of the low-pass filter that estimates the jitter: the mean
-height of the points above the line, which is their mean delay beyond the smallest."""
+delay of the samples beyond the smallest delay, which is their height above the clock line."""
 
 
 class ClockLine:
@@ -87,7 +87,12 @@ class ClockLine:
         self._set_bounded_offset()
 
     def height(self, device_ns: float, arrival_ns: float) -> float:
-        """Return the height of a point above the line: its delay beyond the smallest, in ns."""
+        """Return the height of a point above the line: its delay beyond the smallest, in ns.
+
+        Args:
+            device_ns: Device time of a sample.
+            arrival_ns: Host time at which the sample arrived.
+        """
         return arrival_ns - device_ns - self._track.offset - self._track.drift * device_ns
 
     def add(self, device_ns: float, arrival_ns: int, is_late: bool) -> bool:
