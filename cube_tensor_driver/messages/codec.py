@@ -412,6 +412,9 @@ class MessageCodec(Generic[AnyRows]):
     def _read_layout(self, data: bytes) -> _Layout:
         """Return the layout of a message with the numbers of rows and pads that it states.
 
+        Args:
+            data: Bytes of the serialised message.
+
         Raises:
             MessageError: The message is too short, is not little-endian CDR, or has another length
                 than follows from these numbers.
@@ -454,6 +457,10 @@ class MessageCodec(Generic[AnyRows]):
 
     def _read_stamp(self, layout: _Layout, message: bytes) -> int:
         """Check the sequences of a message, and return its time stamp in ns since the Unix epoch.
+
+        Args:
+            layout: Layout that the message must have.
+            message: Bytes of the serialised message.
 
         Raises:
             MessageError: The number of values of a sequence does not fit the message's numbers of
