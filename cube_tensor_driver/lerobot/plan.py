@@ -135,7 +135,7 @@ class BagPlan:
     left_out: Counter[str]
 
     def find_frames(self, stamp_ns: Times) -> Index:
-        """Return the number (N,) of the interval in which each of N stamps lies."""
+        """Return the number (N,) of the interval (of `edges_ns`) in which each of N stamps lies."""
         return np.searchsorted(self.edges_ns, stamp_ns, side="right")
 
 
