@@ -180,7 +180,7 @@ class Layer:
             surface: psi = 1, psi' = 0, then psi = 0, psi' = 1.
         """
         if np.isinf(self.thickness):
-            return self._add_airy_half_space(zeta)
+            return self._solve_airy_half_space(zeta)
         h = k * self.thickness
 
         def differentiate(n: int, zeta: Array) -> Array:
@@ -218,7 +218,7 @@ class Layer:
         return np.stack(derivatives)
 
     @staticmethod
-    def _add_airy_half_space(zeta: Array) -> Array:
+    def _solve_airy_half_space(zeta: Array) -> Array:
         """Return psi and its derivatives as `_solve_airy`, for a layer of infinite thickness.
 
         psi is a sum of four solutions. Two of them grow with the depth; their factors are 0 here.

@@ -463,7 +463,7 @@ def _compute_cross_covariance(
     pressure = traction_prior.pressure(offset, angles, variants)
     pressure = pressure[:, columns].reshape(n, n_points, width)
     cross = np.empty((n_points, ROWS_PER_POINT, n, width))
-    # The first axis becomes the points, the third and fourth the cubes and their components.
+    # The axes of `cross` are the points, their results, the cubes and the components.
     cross[:, :3] = traction.transpose(1, 3, 0, 2)
     cross[:, 3] = pressure.transpose(1, 0, 2)
     return AMPLITUDE**2 * cross.reshape(-1, n * width)

@@ -49,7 +49,8 @@ def covariance_matrix(
     matrix = np.empty((n, width, n, width))
     matrix[second, :, first] = pairs.swapaxes(1, 2)
     matrix[first, :, second] = pairs
-    # The covariance of a cube with itself is symmetric only up to rounding.
+    # The covariance of a cube with itself is symmetric only up to rounding errors, so the mean of
+    # this matrix and its transpose is used.
     cube = np.arange(n)
     own = pairs[first == second]
     transposed = own.swapaxes(1, 2)

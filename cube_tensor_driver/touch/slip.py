@@ -237,7 +237,7 @@ class SlipEstimator:
         # m. `load` is the load at the cubes' values `values` (Pa), and `weights` is the matrix from
         # changes of these values to changes of the load. `linearised` is the load for which this
         # matrix was computed, and `noise` the standard deviation of the position, in m. `sums` are
-        # those of `_add_ratio`. `past` has the motion states (`_decide_motion_state`) of the last
+        # those of `_add_ratio`. `past` has the motion states (`_compute_motion_states`) of the last
         # scans, newest first. The remaining fields belong to the fit of `Slip.partial`, which is
         # stored in `partial`. `first` are cubes, weights and values in the first scan of the fit,
         # and `terms` are the terms of the fit in the newest scan. `gram` and `moments` are sums
@@ -306,10 +306,10 @@ class SlipEstimator:
         contacts["partial"] = self._estimate_partial_slip()
         normal = contacts["normal"]
         followed = self._follow(scaled)
-        before = _decide_motion_state(followed, normal)
+        before = _compute_motion_states(followed, normal)
         contacts["load"] = [[*one.force, *one.position] for one in found]
         contacts["values"] = self._gather(scaled)
-        after = _decide_motion_state(contacts["load"], normal)
+        after = _compute_motion_states(contacts["load"], normal)
         # The tracker has fitted the loads again. This corrects the errors of the loads that were
         # computed from changes of the values since its last fit. The past states get the same
         # correction, so that it does not look like motion.
@@ -350,7 +350,7 @@ class SlipEstimator:
         loads = self._follow(scaled)
         self._linearise_changed(loads, scaled)
         self._observe_shear(scaled)
-        newest = _decide_motion_state(loads, contacts["normal"])
+        newest = _compute_motion_states(loads, contacts["normal"])
         self._remember(time_s, newest)
 
         earlier = contacts["past"][:, LAGS]
@@ -454,7 +454,7 @@ class SlipEstimator:
         """Test whether each contact has moved, and whether it has slipped, over each of the `LAGS`.
 
         Args:
-            newest: Motion states (n, 7) in this scan, as from `_decide_motion_state`.
+            newest: Motion states (n, 7) in this scan, as from `_compute_motion_states`.
             change: Changes (n, lags, 7) of the motion states over each lag.
             duration: Durations (lags,) of the lags in s.
 
@@ -598,8 +598,8 @@ class SlipEstimator:
         self._noise.update(usable, cubes)
         local = LocalValues(inverse, self._noise, home, cubes)
 
-        # Derivatives are computed in the frame of `home`, the cube nearest to the contact. They are
-        # sorted by distance, so that those of this contact come first.
+        # Derivatives are computed in the frame of `home`, the cube nearest to the contact. Contacts
+        # near this one take part. They are sorted by distance, so that this one comes first.
         rotation = poses.rotation[home]
         apart = _compute_lengths(positions - place)
         is_near = apart < NEIGHBOUR_PITCHES * inverse.pitch
@@ -640,7 +640,7 @@ def _compute_lengths(vectors: Array) -> Array:
     return lengths
 
 
-def _decide_motion_state(loads: Array, normal: Array) -> Array:
+def _compute_motion_states(loads: Array, normal: Array) -> Array:
     """Return the motion states (n, 7) of contacts: the quantities whose changes show slip.
 
     They are the position (3) in m, the shear force divided by the normal force (3), and the natural

@@ -326,8 +326,8 @@ class Touch:
         """Forget the slow parts of cubes; the next samples of the cubes start them again."""
         self._slow[cubes] = np.nan
         self._count[cubes] = 0
-        # A slow part that is held is not averaged over the next samples. It keeps the noise of two
-        # samples: the one before and the one after the restart.
+        # While a slow part is held, it is not averaged over more samples. After the restart, it
+        # therefore contains the noise of two samples: the one before and the one after it.
         margin = RESTART_MARGIN * self._deviation[cubes]
         self._margin[cubes] += self._held[cubes] * margin
 
@@ -379,8 +379,8 @@ class Touch:
         margin = self._margin[cube]
         if self._held.any() or margin.any():
             # A load nearby stops the update of a cube's slow part (`_held`), so drift is no longer
-            # removed from the pressure. The margin grows with it, so that neither drift nor what
-            # remains of an earlier load counts as touch.
+            # removed from the pressure. A margin that grows with the time is subtracted instead, so
+            # that neither drift nor what remains of an earlier load counts as touch.
             remainder = REMAINDER * np.abs(pressure)
             growing = np.fmax(margin, remainder) + MAX_DRIFT * elapsed_s
             fading = (1 - elapsed_s / TIME_CONSTANT_S) * margin
@@ -543,7 +543,8 @@ class Touch:
         place = self._place[cube]
         offset = place[:, None] - place
         pitches = np.linalg.norm(offset, axis=2)
-        # The distance of a load from itself is infinite: only other loads disturb its force.
+        # The distance of a load from itself is set to infinity, because only other loads disturb
+        # the estimate of its force.
         np.fill_diagonal(pitches, np.inf)
         # The errors due to other loads decrease with the distance^-3, their squares with ^-6.
         others = pitches**-6

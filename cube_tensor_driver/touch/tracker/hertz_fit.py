@@ -393,7 +393,8 @@ class HertzFit:
         patterns[3, 5:] = np.array([1, -1]) / (2 * FLATNESS_STEP)
         patterns[4, 5:] = -wider_share, wider_share - 1
         # `slopes` are the derivatives (J, 8, 3, 7) of the forces of the seven contacts by the eight
-        # parameters. Half the derivatives by x and y are shears with a moment of 1 N m.
+        # parameters. A moment of 1 N m is that of half the derivative by x as forces along y, and
+        # minus half the derivative by y as forces along x.
         slopes = np.zeros((len(places), _N_PARAMETERS, 3, 7))
         slopes[:, :3] = np.eye(3)[:, :, None] * patterns[0]
         slopes[:, 3:7] = patterns[1:, None] * self.found.forces[:, None, :, None]

@@ -75,8 +75,8 @@ class CubeNoise:
         self.scaled = scaled
         inverse = self._inverse
         if self._revision != inverse.revision:
-            # The pads in use or the stated errors have changed, so all stored variances are invalid.
-            # The value 0 marks them as such.
+            # The pads in use or the stated errors have changed, so all stored variances are invalid
+            # and are set to 0.
             self._revision = inverse.revision
             self._variance[:] = 0.0
         values = scaled[cubes]

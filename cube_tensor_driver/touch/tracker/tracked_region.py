@@ -255,8 +255,8 @@ class TrackedRegion:
         is_bad = self._is_misfit_larger and self.has_fitted_neighbours
         self._bad_scans = self._bad_scans + 1 if is_bad else 0
         if isinstance(fit, HertzFit):
-            # Each of two fits near each other subtracts the response to the other. Extrapolation of
-            # both would amplify the changes that these corrections cause.
+            # Each of two fits near each other subtracts the response to the contacts of the other.
+            # If both extrapolated, changes of these responses would be amplified in every scan.
             fit.predict(extrapolates=not self.near)
             self._follow_home(fit)
 
@@ -603,8 +603,8 @@ class TrackedRegion:
         discs = discs._replace(log_sizes=log_sizes)
         fit = HertzFit(self._inverse, nodes.values, discs)
         self._iterate(fit, MAX_STEPS)
-        # The evidence of all cubes can hide a misfit of the nearest cubes, which is therefore tested,
-        # too. If there are other regions, their contacts may cause this misfit, and it is ignored.
+        # The evidence of all cubes can hide a misfit of the nearest cubes. So their misfit is
+        # tested, too, except if there are other regions, whose contacts may cause it.
         is_round = fit.shape_misfit < MAX_HERTZ_MISFIT or np.isfinite(self.gap)
         if is_round and not fit.is_unsettled and fit.score < nodes.score:
             self._accept(fit)
