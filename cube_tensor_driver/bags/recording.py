@@ -113,7 +113,7 @@ class Recording:
             (M,) indices.
         """
         n_earlier = np.searchsorted(self._since_ns, newest_ns, side="right")
-        # The first SkinInfo is the best known one for messages before it, too.
+        # For messages of frequencies before the first SkinInfo, the first one is used, too.
         index: Index = np.maximum(n_earlier - 1, 0)
         return index
 

@@ -86,8 +86,8 @@ class BagSource:
     def __iter__(self) -> Iterator[FrequencyRows]:
         """Yield all rows (samples of cubes) in the order of recording.
 
-        The rows of several messages are delivered together, which is faster, where reconstructing
-        them together gives the same stress as one message after the other.
+        Successive messages are delivered together if their reconstruction then gives the same
+        stress as that of one message after the other. This is faster.
 
         Raises:
             BagError: The bag is damaged.

@@ -13,8 +13,8 @@ import numpy as np
 from ..core.arrays import AnyArray, Index, Mask, Times
 
 BLOCK_BYTES = 1 << 18
-"""Minimum total size, in bytes, of the messages that are joined to one block if the storage file is
-not divided into blocks itself."""
+"""Minimum total size, in bytes, of the messages that are joined to one block. Messages in a chunk
+of an MCAP file lie in one block already, and are not joined."""
 
 
 @dataclass(frozen=True, slots=True)

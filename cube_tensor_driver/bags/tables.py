@@ -91,7 +91,8 @@ def make_cube_column(
 
     Args:
         rows: N rows.
-        cubes: Names of the cubes by their indices, then a last name for unknown cubes.
+        cubes: Names of the skin's cubes in the order of their indices, and one more name, which all
+            rows with a higher index get.
     """
     index = np.minimum(rows.cube, len(cubes) - 1)
     return pyarrow.DictionaryArray.from_arrays(index.astype(np.int32), cubes)
@@ -102,7 +103,8 @@ def make_stress_batch(rows: StressRows, cubes: pyarrow.Array) -> pyarrow.RecordB
 
     Args:
         rows: N rows.
-        cubes: Names of the cubes by their indices, then a last name for unknown cubes.
+        cubes: Names of the skin's cubes in the order of their indices, and one more name, which all
+            rows with a higher index get.
     """
     columns = [
         pyarrow.array(rows.stamp_ns),
@@ -131,7 +133,7 @@ class BufferedTable:
     """Base class of tables of stress; it collects rows (samples of cubes) until a part is large."""
 
     def __init__(self, path: Path) -> None:
-        """Begin an empty table of stress; `path` is the file or folder that errors name."""
+        """Begin an empty table of stress; `path` is the file or folder for error messages."""
         self._path = path
         self._waiting: list[StressRows] = []
         self._waiting_rows = 0
@@ -178,7 +180,8 @@ class TableWriter(BufferedTable):
 
         Args:
             path: File to create; the format is CSV if its suffix is ``.csv``, otherwise Parquet.
-            cubes: Names of the cubes by their indices, then a last name for unknown cubes.
+            cubes: Names of the skin's cubes in the order of their indices, and one more name, which
+                all rows with a higher index get.
 
         Raises:
             BagError: The file cannot be written.

@@ -45,8 +45,8 @@ class ZarrWriter(BufferedTable):
 
         Args:
             path: Folder of the group, which is created or replaced.
-            cubes: Names of the cubes by their indices, then a last name for unknown cubes.
-                They are stored as an attribute of the column `cube`.
+            cubes: Names of the skin's cubes in the order of their indices, and one more name for
+                all rows with a higher index. They become an attribute of the column `cube`.
 
         Raises:
             BagError: The installed library zarr is older than version 3.

@@ -132,7 +132,8 @@ def make_table(path: Path, cubes: list[str]) -> BufferedTable:
 
     Args:
         path: Table to create, ending in .zarr, .csv or .parquet.
-        cubes: Names of the cubes by their indices, and a last name for unknown cubes.
+        cubes: Names of the skin's cubes in the order of their indices, and one more name, which all
+            rows with a higher index get.
 
     Raises:
         ModuleNotFoundError: The library zarr, which .zarr requires, is not installed.
