@@ -123,7 +123,11 @@ class SimulatedHub:
         return self.boot_us + now_us + gained
 
     def _compute_positive_device_us(self, now_us: int) -> int:
-        """Return the hub's clock in µs, or 0 if it is negative: frames hold unsigned times."""
+        """Return the value of the hub's clock in µs, or 0 if that is negative.
+
+        A clock that the fault `step` has set back can be negative, but times in frames have no
+        sign.
+        """
         return max(0, self.device_us(now_us))
 
     def set_clock(

@@ -44,8 +44,8 @@ MAX_SEED = (1 << 63) - 1
 """Largest seed of the random deviations of the pads: the largest signed 64-bit integer."""
 
 GROWTH_S = 600.0
-"""Time, in s, after the begin of a steady load, at which the stress that pads report has grown by
-creep as `Imperfections.creep_growth` states."""
+"""Time, in s, after the begin of a steady load. `Imperfections.creep_growth` states how much the
+stress that pads report has grown by creep until this time."""
 
 MAX_DEVIATIONS = 6
 """Largest deviation of the creep of a pad from the mean, in standard deviations. Random deviations
@@ -117,8 +117,8 @@ _SCHEMA = Schema(
 """Schema of the file of imperfections."""
 
 _TABLES = {"creep", "temperature", "air", "poses"}
-"""Names of the fields of `Imperfections` that hold rows of numbers. Their rows are lists in a file
-and tuples in an instance, so they are converted."""
+"""Names of the fields of `Imperfections` that hold rows of numbers. Each row is a list in the YAML
+file and a tuple in an instance, so these fields are converted from one to the other."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,8 +18,8 @@ MAX_QUEUED_BYTES = 1 << 16
 there is no room."""
 
 BURST_PERIOD_US = 16_000
-"""Period, in µs, at which a line under the fault `burst` sends all waiting bytes. It is that of the
-latency timer of common USB serial chips."""
+"""Period, in µs, at which a line under the fault `burst` sends all waiting bytes. The latency timer
+of common USB serial chips has the same period."""
 
 _READ_BYTES = 65536
 """Maximum number of bytes that one read from a line returns."""

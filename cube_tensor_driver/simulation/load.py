@@ -37,7 +37,7 @@ MAX_CACHED_BYTES = 64 << 20
 
 _ORDERS = np.array([2, 3, 4, 6, 8, 11, 16, 23, 32, 45, 64])
 """Numbers of concentric rings of point forces by which a contact can be represented (quadrature
-orders). They are few, so that many cubes have the same number and are computed together."""
+orders). There are only a few, so that many cubes have the same order and are computed together."""
 
 _FAR_RATIO = 0.15
 """Ratio of the radius of a contact to the distance between a cube and the rim of the contact. Below
@@ -45,7 +45,7 @@ this ratio, one ring of point forces represents the contact accurately enough fo
 
 
 def default_script() -> Script:
-    """Read the load script in the package: an indenter moves over a whole skin of any size."""
+    """Read the load script in the package, in which an indenter moves over a skin of any size."""
     return read_script(package_data() / "config" / "load_demo.yaml")
 
 

@@ -192,8 +192,8 @@ class SampleTable:
         number: (S,) number of the sample, which does not wrap at 2^32.
         time_ns: (S,) wall clock at which the sample was taken, in ns since the Unix epoch.
         rows_per_sample: (links,) number of the skin's cubes on each link.
-        link_of_cube: (`CUBE_RANGE`,) index of the link of the cube with each possible index, or
-            `NO_LINK`.
+        link_of_cube: (`CUBE_RANGE`,) for each possible index of a cube in the skin, the index of
+            the cube's link, or `NO_LINK`.
     """
 
     link: Index

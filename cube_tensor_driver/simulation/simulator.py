@@ -251,8 +251,8 @@ class Simulator:
     def _find_due_us(self, report_us: int) -> int:
         """Return the simulated time in µs at which the simulator has to act next.
 
-        It is the time of the next sample, of the next report (HELLO and STATS), of the next begin
-        or end of a fault, or at which delayed bytes can be sent, whichever is earliest.
+        This is the earliest of the following times: the next sample of a hub, the next report
+        (HELLO and STATS), the next begin or end of a fault, and the end of a delay of bytes.
 
         Args:
             report_us: Simulated time in µs of the next HELLO and STATS.

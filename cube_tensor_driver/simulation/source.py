@@ -104,8 +104,9 @@ class SimulatedSource:
 
     One scan has a row (sample) of every cube. The rows are sorted link by link, as the driver
     delivers them. All rows of scan k have the sequence number k and the stamp k × period, in ns
-    since the start of the load script. Frequencies are rounded as those of a real hub: whole mHz,
-    in Hz as float32. They are NaN for pads that a cube does not have or whose oscillator stopped.
+    since the start of the load script. Frequencies are in Hz as float32, rounded to whole mHz as
+    those of a real hub. They are NaN for pads that a cube does not have or whose oscillator
+    stopped.
     The temperature is unknown (NaN) unless the imperfections state it, and the rows have specific
     forces if the imperfections state poses.
 

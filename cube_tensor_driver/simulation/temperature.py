@@ -107,7 +107,8 @@ def read_thermal_stress(name: str, n_pads: int) -> ThermalLayer:
 class WarmLayer:
     """Computes the temperature across the elastomer layer at some cubes as time advances.
 
-    The temperature in the layer follows from those of the ground below it and of the air above it.
+    The layer contains the cubes. It lies on the ground, the body that carries the skin, and its
+    surface is in the air. The temperatures of ground and air determine that of the layer.
     """
 
     def __init__(

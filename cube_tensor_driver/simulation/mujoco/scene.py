@@ -30,8 +30,9 @@ KEPT_S = 2.0
 of a skin need the contacts at slightly different times, and a scene is only computed forwards."""
 
 UNBOUNDED_PERIOD_S = 10.0
-"""Attribute `period`, in s, of the load of a scene that never repeats. With option `--instants`,
-the load of this first part of the scene is computed in advance and played again and again."""
+"""Length, in s, of the first part of a scene that never repeats. This part stands for the endless
+scene where a finite length is needed. For example, the option `--instants` computes the load of
+this part in advance and plays it again and again."""
 
 
 def read_scene(path: Path) -> MjModel:
