@@ -135,10 +135,11 @@ def paint_squares(
 ) -> list[Mesh]:
     """Return one mesh for each colour of `step_colours`, with the squares of this colour.
 
-    The squares are the field of a skin, and the cubes of a large skin. With one mesh for each
-    colour, a skin consists of few objects, and a computer without a graphics card can draw it often
-    enough. An image would be less data, but browsers decode images asynchronously: a slow browser
-    would show the field of one instant together with the cubes of a later one.
+    The squares show the field (values between the cubes) of a skin, and in a large skin also the
+    cubes. With one mesh for each colour, a skin consists of few objects, and a computer without a
+    graphics card can draw it often enough. An image would be less data, but browsers decode images
+    asynchronously: a slow browser would show the field of one instant together with the cubes of a
+    later one.
 
     Args:
         corners: (M, 4, 3) corners of the squares.

@@ -212,8 +212,8 @@ class Ranges(NamedTuple):
 
     Attributes:
         colours: Value at the upper end of the colour scale.
-        traction: Traction (force per area on the upper face) of the longest arrow, in Pa.
-        gradient: Gradient of the pressure of the longest arrow, in Pa/m.
+        traction: Traction (force per area on the upper face), in Pa, that the longest arrow shows.
+        gradient: Gradient of the pressure, in Pa/m, that the longest arrow shows.
     """
 
     colours: float = 0.0

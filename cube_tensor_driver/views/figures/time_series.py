@@ -74,8 +74,8 @@ def read_cube_series(
         seconds = (rows.stamp_ns - bag.start_ns) * 1e-9
         is_in_time = (seconds >= start_s) & (seconds <= end_s)
         chosen = is_in_time & (rows.cube == number)
-        # The array has a column for each pad of the cube with the most pads; those behind the
-        # pads of this cube are unused.
+        # The array has as many columns as the cube with the most pads requires. Only the first
+        # `n_pads` of them are pads of this cube.
         frequencies.append(segment.messages.rows.frequency[chosen, :n_pads])
         parts.append(rows.select(chosen))
     n_samples = sum(map(len, parts))
