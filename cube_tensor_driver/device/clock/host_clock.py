@@ -8,8 +8,8 @@ import time
 from collections.abc import Callable
 
 MIN_HOST_STEP_NS = 1_000_000
-"""Smallest step of the host's clock, in ns, that is detected. Smaller deviations from the monotonic
-clock count together, once their sum reaches this size."""
+"""Smallest step of the host's clock, in ns, that is detected. Smaller steps are detected together,
+once their sum reaches this size."""
 MAX_READ_NS = 100_000
 """Longest time, in ns, that reading the host's clock may take. If it takes longer, the thread was
 interrupted, and the clocks are compared at the next reading."""

@@ -26,9 +26,9 @@ MAX_PAUSE_NS = 60_000_000_000
 continued. If both clocks show a longer pause, a new line is begun, because the error of the drift,
 up to 6 ms per minute, would look like a step."""
 MIN_STEP_US = 4000.0
-"""Smallest deviation, in µs, at which a step of the hub's clock is suspected: of the device time
-between two samples from the number of sample periods between them times the period. Steps of 5 ms
-shall be found; 1 ms is left for the jitter of the hub."""
+"""Smallest difference, in µs, at which a step of the hub's clock is suspected. The device time
+between two samples is compared with the time that follows from their numbers and the sample period.
+Steps of 5 ms shall be found; 1 ms is left for the jitter of the hub."""
 PERIOD_SAMPLES = 64
 """Time constant, in samples, of the low-pass filter that estimates the sample period."""
 DECISION_NS = 200_000_000
