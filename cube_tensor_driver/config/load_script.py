@@ -33,7 +33,7 @@ FRICTION_SAMPLES = 1001
 limit of friction (coefficient of friction times normal force)."""
 
 _TIME = real("a time in s from 0 up", minimum=0)
-"""Schema of a time in s after the start of the script."""
+"""Schema of a time, in s after the start of the load script."""
 _PEAK_FORCE = real("a force in N greater than 0", exclusiveMinimum=0)
 """Schema of the largest normal force of a tap."""
 _FORCE: JsonSchema = {
@@ -47,8 +47,9 @@ _FORCE: JsonSchema = {
     ],
     "description": "a force in N greater than 0, or a list of at least two from 0 up",
 }
-"""Schema of a normal force: its largest value, or values at equal intervals during the action. With
-a single value, the force rises from 0 in the first third and falls to 0 in the last third."""
+"""Schema of an indenter's normal force: its largest value, or values at equal intervals during the
+action. With a single value, the force rises from 0 in the first third and falls to 0 in the last
+third of the action."""
 _SHEAR: JsonSchema = {
     "anyOf": [
         TRIPLE,
@@ -60,8 +61,9 @@ _SHEAR: JsonSchema = {
     ],
     "description": "a force [x, y, z] in N, or a list of at least two",
 }
-"""Schema of a tangential force: its value at the largest normal force, or values at equal intervals
-during the action. A single value means that it is proportional to the normal force."""
+"""Schema of an indenter's tangential force: its value at the largest normal force, or values at
+equal intervals during the action. With a single value, the tangential force is proportional to the
+normal force."""
 _TIMES = integer(1, MAX_TAPS, f"an integer from 1 to {MAX_TAPS}")
 """Schema of the number of taps of one action."""
 _PATH = list_of(TRIPLE, "positions [x, y, z]", 2)
@@ -89,7 +91,7 @@ _ACTIONS: JsonSchema = {
     "roll": _make_action_schema({"shear": _SHEAR}, path=_PATH, force=_FORCE),
     "tap": _make_action_schema({"times": _TIMES}, at=TRIPLE, force=_PEAK_FORCE),
 }
-"""Kind of an action -> schema of its keys."""
+"""Kind of an indenter's action (press, slide, roll or tap) -> schema of the keys of the action."""
 _ACTION = mapping((), _ACTIONS) | {
     "minProperties": 1,
     "maxProperties": 1,

@@ -91,7 +91,8 @@ _ELASTOMER = mapping(
         "poisson": real("0 to 0.5", minimum=0, maximum=0.5),
     },
 )
-"""Schema of the elastomer above the cubes."""
+"""Schema of the elastomer in which the cubes are embedded: depth of their centres, thickness of the
+layer, and Poisson's ratio."""
 _SCHEMA = Schema(
     mapping(
         ("name", "parent_frame", "links", "cubes"),
