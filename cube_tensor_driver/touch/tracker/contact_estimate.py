@@ -98,7 +98,10 @@ def discs_of(estimates: Sequence[ContactEstimate]) -> Discs:
 
 
 def moment_polynomials(places: Array) -> Array:
-    """Return the polynomials (q, `N_MOMENTS`) of positions (q, 2) whose integrals are moments."""
+    """Return 1, x, y, x^2, x y and y^2 (q, `N_MOMENTS`) at positions (q, 2).
+
+    Their sums over the nodes of a contact, weighted with the forces, are the moments.
+    """
     x, y = places.T
     return np.stack([np.ones(len(x)), x, y, x**2, x * y, y**2], axis=1)
 

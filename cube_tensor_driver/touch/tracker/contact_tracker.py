@@ -334,7 +334,7 @@ class ContactTracker:
         return total, deviation
 
     def _respond(self, cubes: Index) -> tuple[Array, Array]:
-        """Compute stale responses of some cubes again, and return `_sum_responses`.
+        """Return `_sum_responses`, after outdated responses of some cubes are computed again.
 
         Args:
             cubes: Indices (n,) of the cubes.

@@ -334,7 +334,7 @@ class NodeFit:
         return ContactSum(self.places, sizes, self.forces, root)
 
     def _set_sensitivity(self, sensitivity: Array) -> None:
-        """Set how the values change by errors of the elastomer under the present forces.
+        """Store how errors of the elastomer change the values under the present forces.
 
         Args:
             sensitivity: Changes (n, C, S) in Pa by one standard deviation of each of S properties
@@ -419,7 +419,7 @@ class NodeFit:
         return np.asarray(envelope.clip(ENVELOPE_FLOOR))
 
     def _separate_contacts(self) -> None:
-        """Assign each node to one of the peaks of the pressure, which are contacts."""
+        """Assign each node to one of the peaks of the pressure; each peak is a contact."""
         exponents = self._squared_distances / (2 * self._peak_width**2)
         smoothing = np.exp(-exponents)
         root = self.posterior.root

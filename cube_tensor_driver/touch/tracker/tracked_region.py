@@ -305,8 +305,9 @@ class TrackedRegion:
                 fit.move_home(self._collect(home, cubes))
 
     def _collect(self, home: int, cubes: Index) -> LocalValues:
-        """Return noise and positions, for a fit, of the cubes that respond to contacts above its
-        home cube.
+        """Return noise and positions of the cubes from whose values a region is fitted.
+
+        They respond to contacts above the home cube of the fit.
 
         Args:
             home: Index of the home cube, around which the skin is laid flat for the fit.
@@ -319,7 +320,7 @@ class TrackedRegion:
         return LocalValues(self._inverse, self._noise, home, facing)
 
     def _whiten_newest(self, values: LocalValues) -> Array:
-        """Compute noise and response to other regions for the newest values, return `_whiten`."""
+        """Return `_whiten` after an update of the noise and of the response to other regions."""
         self._noise.update(self._noise.scaled, values.cubes)
         self.subtract_others(values, *self._respond(values.cubes))
         values.refresh()
@@ -502,7 +503,7 @@ class TrackedRegion:
         return values.whiten(self._noise.scaled, self.others)
 
     def _iterate(self, fit: HertzFit, steps: int) -> None:
-        """Make Gauss-Newton steps, at most a number of them, until the fit has converged."""
+        """Make Gauss-Newton steps until the fit has converged, but at most `steps`."""
         white = self._whiten(fit.values)
         for _ in range(steps):
             linearise(self._inverse, [fit])
