@@ -31,7 +31,7 @@ class HostClockWatch:
         self._offset = clock_ns() - steady_ns()
 
     def look(self) -> tuple[int, int]:
-        """Return the time of the host's clock, and its step since the last call, in ns."""
+        """Return the time of the host's clock and the step detected since the last call, in ns."""
         before = self._steady_ns()
         now = self._clock_ns()
         was_interrupted = self._steady_ns() - before >= MAX_READ_NS

@@ -406,9 +406,9 @@ class SampleAccount:
         }
 
     def _total(self) -> SequenceCounters:
-        """Return the sums of the counters of all parts of the samples, also of ended ones.
+        """Return the sums of the counters of all parts (frames into which a sample is divided).
 
-        Samples that the module in C has counted are not included.
+        Parts that the hub no longer sends are included; samples counted by the module in C are not.
         """
         total = replace(self._ended)
         for tracker in self._trackers.values():
