@@ -58,8 +58,8 @@ def describe(rows: AnyArray, is_chosen: Mask) -> Part:
 def summarise(parts: Sequence[Part], frames: int) -> dict[str, list[object]]:
     """Return the statistics of all rows of a feature.
 
-    A number without any known value has mean 0 and standard deviation 1, which leave values
-    unchanged on normalisation.
+    An element of the rows that has no known value gets mean 0 and standard deviation 1, which leave
+    values unchanged on normalisation.
 
     Args:
         parts: Results of `describe`, which together cover all rows.
@@ -67,7 +67,7 @@ def summarise(parts: Sequence[Part], frames: int) -> dict[str, list[object]]:
             data sets.
 
     Returns:
-        Lists of the shape of a row for each statistic, by its name in LeRobot.
+        Each statistic, as nested lists of the shape of a row, by its name in LeRobot.
     """
     described, samples = zip(*parts, strict=True)
     count, means, variances, lows, highs = np.stack(described, axis=1)

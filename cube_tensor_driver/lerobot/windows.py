@@ -31,8 +31,9 @@ def stream_windows(
 ) -> Iterator[dict[str, AnyArray]]:
     """Arrange rows that arrive in parts, and yield the windows of one block of frames at a time.
 
-    Rows may arrive in any order of frames, because hubs deliver with different delays. The counts
-    tell when all rows of a block have arrived.
+    A window contains all samples of every cube in one frame. Rows may arrive in any order of
+    frames, because hubs deliver with different delays. The counts tell when all rows of a block
+    have arrived.
 
     Args:
         parts: Frame number (N,) of N rows, and the rows.
