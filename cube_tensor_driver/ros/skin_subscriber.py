@@ -37,7 +37,6 @@ class FollowedSkin:
         info: The newest SkinInfo message (names, poses and calibrations of the cubes).
         poses: Poses of the cubes in the parent frame of the skin.
         newest: The newest stress of each cube.
-        messages: Number of messages of `stress` received so far.
         stamp_ns: Stamp of the newest message of `stress`, in ns since the Unix epoch; 0 before the
             first message.
     """
@@ -45,7 +44,6 @@ class FollowedSkin:
     info: SkinInfo
     poses: CubePoses
     newest: LatestStress
-    messages: int = 0
     stamp_ns: int = 0
 
 
@@ -127,7 +125,6 @@ class SkinSubscriber:
             log_refused_message(self._node, "stress", error)
             return
         self.skin.newest.update(message.rows, self.now())
-        self.skin.messages += 1
         self.skin.stamp_ns = int(message.stamp_ns[0])
         if self._on_stress is not None:
             self._on_stress(self.skin.stamp_ns, message.rows)
@@ -171,7 +168,8 @@ class SkinSubscriberNode(CubeNode):
     def compute_message(self, skin: FollowedSkin, health: Index) -> object:
         """Return the message to publish now, or its serialised bytes; subclasses override it.
 
-        It is called `rate` times per second. If it returns None, nothing is published.
+        It is called `rate` times per second, or if `follow_stress` is overridden, at a message of
+        `stress` as often as that. If it returns None, nothing is published.
 
         Args:
             skin: The state of the skin.
@@ -182,7 +180,8 @@ class SkinSubscriberNode(CubeNode):
     def follow_stress(self, skin: FollowedSkin, health: Index) -> object:
         """Return a message to publish at once, without waiting for the next regular one, or None.
 
-        If a subclass overrides this method, it is called at each `stress` message.
+        If a subclass overrides this method, it is called at each `stress` message at which
+        `compute_message` is not called.
 
         Args:
             skin: The state of the skin.
@@ -195,9 +194,20 @@ class SkinSubscriberNode(CubeNode):
 
     def configure(self) -> None:
         is_followed = type(self).follow_stress is not SkinSubscriberNode.follow_stress
+        period_s = 1.0 / self.value("rate")
+        due_s = 0.0
 
         def receive(stamp_ns: int, rows: StressRows) -> None:
-            publish(self.follow_stress)
+            nonlocal due_s
+            now_s = subscriber.now()
+            # Messages of stress are not exactly periodic, so one may come half a period too early.
+            # If it comes more than two periods too early, the clock was set back.
+            early_s = due_s - now_s
+            if period_s / 2 < early_s < 2 * period_s:
+                publish(self.follow_stress)
+                return
+            due_s = max(min(due_s, now_s + period_s), now_s) + period_s
+            publish(self.compute_message)
 
         subscriber = SkinSubscriber(self, self.prepare, receive if is_followed else None)
         self.call_at_cleanup(subscriber.close)
@@ -217,5 +227,6 @@ class SkinSubscriberNode(CubeNode):
             if message is not None:
                 publisher.publish(message)
 
-        compute = partial(publish, self.compute_message)
-        self.own(self.create_timer(1.0 / self.value("rate"), compute))
+        if not is_followed:
+            compute = partial(publish, self.compute_message)
+            self.own(self.create_timer(period_s, compute))

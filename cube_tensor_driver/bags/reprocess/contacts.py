@@ -174,7 +174,6 @@ class ContactWriter:
         health = self._latest.health(time_s, STALE_S)
         values = self._latest.usable_values(health)
         is_due = self._is_due(stamp_ns)
-        begins_to_slip = finder.follow(time_s, values)
         if is_due:
             finder.update(
                 time_s,
@@ -183,7 +182,7 @@ class ContactWriter:
                 self._latest.status,
                 touches,
             )
-        elif not begins_to_slip:
+        elif not finder.follow(time_s, values):
             return
         message = make_contacts_message(
             make_message,

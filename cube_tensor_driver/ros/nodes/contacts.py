@@ -80,7 +80,6 @@ class Contacts(SkinSubscriberNode):
         # For each field of ContactSettings the node has a parameter of the same name.
         names = [field.name for field in fields(ContactSettings)]
         settings = ContactSettings(**{name: self.value(name) for name in names})
-        self._processed_messages = 0
         self._finder = None
         self._set_up = partial(
             contact_finder,
@@ -97,10 +96,8 @@ class Contacts(SkinSubscriberNode):
         health: Index,
     ) -> SkinContacts | None:
         finder = self._take_finder()
-        # The finder tracks contacts over time, so it must not get the same stress twice.
-        if finder is None or skin.messages == self._processed_messages:
+        if finder is None:
             return None
-        self._processed_messages = skin.messages
         newest = skin.newest
         values = newest.usable_values(health)
         frame_id = skin.info.header.frame_id
