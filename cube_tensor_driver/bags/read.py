@@ -518,7 +518,7 @@ class Bag:
         topic: str,
         codec: MessageCodec[FrequencyRows] | MessageCodec[StressRows],
     ) -> Iterator[tuple[AnyArray, Times]]:
-        """Join successive messages of equal shape (frame id, number of rows) to batches.
+        """Join successive messages of equal shape (frame id, number of rows) into batches.
 
         Decoding many messages with one call of numpy takes hardly longer than decoding one.
 

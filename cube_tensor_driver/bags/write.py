@@ -58,7 +58,7 @@ class _Part:
     n_bytes: int = 0
 
     def write(self, topic: str, time_ns: int, data: bytes) -> None:
-        """Write a message; arguments as those of `BagWriter.write`."""
+        """Write a message; the arguments are those of `BagWriter.write`."""
         self.file.write(self.channels[topic], time_ns, data)
         if self.first_ns is None:
             self.first_ns = self.start_ns = self.end_ns = time_ns

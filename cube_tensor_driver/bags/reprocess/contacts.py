@@ -144,7 +144,7 @@ class ContactWriter:
             self._write(stamp_ns, time_ns, newest)
 
     def _is_due(self, stamp_ns: int) -> bool:
-        """Return whether contacts are due: one period after the last time, or when time jumps back.
+        """Return whether contacts are due, one period after the last ones or after a jump back.
 
         Args:
             stamp_ns: Stamp of the message of frequencies, in ns since the Unix epoch. If the result
