@@ -27,9 +27,9 @@ ROOM_CELSIUS = 25.0
 """Temperature in °C at which pads have the rest frequencies of their calibration."""
 
 OPEN_FACTOR = 8
-"""Factor by which the frequency of a pad rises if its lead is broken (fault `open`), because only
-the parasitic capacitance remains. No stress can cause such a high frequency if the parasitic
-capacitance is 0.3 times that of the pad at rest (the usual value)."""
+"""Factor by which the frequency of a pad rises if its lead is broken (fault `open`), because only a
+part of the parasitic capacitance remains. Stress can raise the frequency at most 4.3 times if the
+parasitic capacitance is 0.3 times that of the pad's foam at rest (the usual value)."""
 
 MAX_MILLIHERTZ = 0xFFFFFFFF
 """Highest frequency, in mHz, that the 32 bits for a pad in a message of a hub can hold."""
@@ -148,8 +148,9 @@ class Injector:
         self.records: list[FaultRecord] = []
         self._links = {link.name: link for link in links}
         self._random = np.random.default_rng(seed)
-        # Heap (priority queue) of begins and ends of faults: simulated time in µs, whether it is a
-        # begin (at the same time, ends come first), serial number, action.
+        # Heap (priority queue) of begins and ends of faults. An entry has the simulated time in µs,
+        # whether it is a begin (at the same time, ends come first), a serial number, and the
+        # function that begins or ends the fault.
         self._schedule: list[tuple[int, bool, int, Callable[[int], None]]] = []
         self._numbers = itertools.count()
         for fault in faults:

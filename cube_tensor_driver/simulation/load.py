@@ -410,8 +410,8 @@ def total(loads: Sequence[ContactLoad | Contact]) -> Resultant:
 def remember(load: Fields) -> Callable[[int], StressField]:
     """Return a function of a time in whole µs that gives the stress fields of a load.
 
-    It keeps the fields of a load that repeats for the next period, because computing them takes
-    long.
+    If the load repeats, the function keeps the fields for the next period, because computing them
+    takes long.
     """
     period_us = math.inf if load.repeats is None else round(1e6 * load.repeats)
     field_bytes = sum(part.nbytes for part in load.at(0.0))

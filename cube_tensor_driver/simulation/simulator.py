@@ -51,7 +51,8 @@ MAX_WAIT_S = 1.0
 have asked the hubs to send no more samples (STOP)."""
 
 MAX_STEP_S = 0.05
-"""Maximum time, in seconds, from the request to end the simulator until it notices it."""
+"""Maximum time, in seconds, for which the simulator waits for the next event. After this time at
+the latest, it notices a request to end."""
 
 REPORT_PERIOD_US = 1_000_000
 """Period, in µs, at which a hub sends the HELLO frame (its description) and the STATS frame (its

@@ -51,7 +51,8 @@ class CubicSpline:
         knots = points[:-1] if closed else points
         n = len(knots)
         # Row i + 1 of `extend` selects the control point c[i] from the n control points of the
-        # knots. The first and last rows select those that mirror or repeat them beyond the ends.
+        # knots. The rows before the first and after the last of these are for control points beyond
+        # the ends, which mirror or repeat some of them.
         rows_added = ((1, 1 + closed), (0, 0))
         identity = np.eye(n)
         if closed:

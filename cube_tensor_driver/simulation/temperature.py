@@ -48,7 +48,7 @@ the error of the temperature in the layer is below 2e-3 of the step."""
 
 
 class ThermalLayer(NamedTuple):
-    """Layer with cubes, as a file of `./cube fem --load temperature` describes it.
+    """Elastomer layer with cubes, as a file of `./cube fem --load temperature` describes it.
 
     Attributes:
         height: Height of the layer, in m.
