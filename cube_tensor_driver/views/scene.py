@@ -368,7 +368,8 @@ def make_principal_crosses(
         length: Length of the lines, in metres per Pa.
 
     Returns:
-        Both ends of each line (N, 3, 2, 3), in metres; whether the stress is tension (N, 3).
+        Both ends of each line (N, 3, 2, 3), in metres; and for each line whether its principal
+        stress is tension (N, 3).
     """
     stress = np.nan_to_num(values[:, : len(STRESS)])
     # Each row of `directions` is one principal direction, in the frame of the cube.

@@ -203,7 +203,7 @@ def draw_thermal_fit(fit: ThermalFit) -> Figure:
     figure = Figure(figsize=(7, 6))
     warm, before, after = figure.subplots(3, 1)
     # The times of the blocks begin at 0 in each bag. So the index of a block is drawn instead,
-    # which puts the bags one after the other. It is a time in s, because a block lasts 1 s.
+    # which puts the bags one after the other. A block lasts 1 s, so its index is a time in s.
     time = np.arange(len(data.seconds)) / 60
     warm.plot(
         time,
