@@ -159,9 +159,9 @@ def parse_file_number(stem: str) -> int:
     """Return the number that rosbag2 gave a storage file of a bag, counted from 0.
 
     Args:
-        stem: Name of the file without suffix. From ROS 2 Lyrical on it is number, prefix and time,
-            such as ``10_run_2026_05_01-10_30_00``; in older versions it is prefix and number, such
-            as ``run_10``. The result for any other name is 0.
+        stem: Name of the file without suffix. From ROS 2 Lyrical on, the name consists of number,
+            prefix and time, such as ``10_run_2026_05_01-10_30_00``; in older versions, of prefix
+            and number, such as ``run_10``. The result for any other name is 0.
     """
     dated = _DATED_NAME.fullmatch(stem)
     digits = dated[1] if dated else stem.rpartition("_")[2]
