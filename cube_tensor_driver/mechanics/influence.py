@@ -85,7 +85,7 @@ class Influence:
 
     @property
     def reach(self) -> float:
-        """Radius in m of the largest circle around the cube's centre that lies within the grid."""
+        """Radius in m of the largest circle within the grid about the point above the cube."""
         smallest = -self.place.min(axis=0).max()
         largest = self.place.max(axis=0).min()
         return float(min(smallest, largest))

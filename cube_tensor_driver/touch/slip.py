@@ -126,7 +126,7 @@ since this update."""
 MAX_SHIFT_DEPTHS = 0.2
 """Shift of a contact, divided by the depth of the cubes' centres below the surface, after which the
 derivatives of the cubes' values by the contact's force and position are computed again. The shift
-is counted from where they were computed last. `MIN_SHIFT_DEPTHS` must be exceeded, too."""
+is counted from the position for which they hold. `MIN_SHIFT_DEPTHS` must be exceeded, too."""
 
 MIN_SHIFT_DEPTHS = 0.1
 """Shift of a contact since the last fit of the contact tracker, divided by the depth of the cubes'
@@ -160,18 +160,20 @@ changes of the cubes' values are attributed to changes of both contacts."""
 
 
 MAX_NORMAL_CHANGE = 0.05
-"""Largest change of the normal force of a contact during the fit of `Slip.partial`, divided by the
-force; after a larger change, the fit starts again. The fit includes a term for the normal force, so
-that changes of 2 % did not change the result."""
+"""Largest change of the normal force of a contact during the fit of `Slip.partial` (measure of
+partial slip), divided by the force; after a larger change, the fit starts again. The fit includes a
+term for the normal force, so that changes of 2 % did not change the result."""
 
 MAX_SHIFT_M = 2e-4
-"""Largest motion of a contact, in m, during the fit of `Slip.partial`; after a larger motion, the
-fit starts again. Motion changes the stresses like partial slip, by as much if it is 1 mm. A motion
-of 0.1 mm gave values up to 0.05 in simulations of flat punches, which have no partial slip."""
+"""Largest motion of a contact, in m, during the fit of `Slip.partial` (measure of partial slip);
+after a larger motion, the fit starts again. Motion changes the stresses like partial slip, by as
+much if it is 1 mm. A motion of 0.1 mm gave values up to 0.05 in simulations of flat punches, which
+have no partial slip."""
 
 PARTIAL_DEVIATION = 0.01
-"""Largest standard deviation of `Slip.partial` due to the noise of the pads. If it is larger, as it
-is while the shear force has changed little, `Slip.partial` is unknown (NaN)."""
+"""Largest standard deviation of `Slip.partial` (measure of partial slip) due to the noise of the
+pads. If it is larger, as it is while the shear force has changed little, the measure is unknown
+(NaN)."""
 
 
 class Slip(NamedTuple):
@@ -429,7 +431,7 @@ class SlipEstimator:
         contacts["gram"][is_over] = contacts["moments"][is_over] = 0
 
     def _estimate_partial_slip(self) -> Array:
-        """Return `Slip.partial` (n,)."""
+        """Return `Slip.partial` (n,) by the least-squares fit at the head of this file."""
         contacts = self._contacts
         terms, curved = contacts["terms"], contacts["terms"][:, 5:]
         # The shear force has no component along the normal, and all sums are 0 at the begin of a
@@ -499,7 +501,7 @@ class SlipEstimator:
         return moves, slips
 
     def _remember(self, time_s: float, newest: Array) -> None:
-        """Store the motion states (n, 7) of the contacts in a scan at a time in s."""
+        """Store the motion states `newest` (n, 7) of the scan at the time `time_s` (in s)."""
         past = self._contacts["past"]
         if time_s < self._times[0]:
             # The time has jumped back, as at the start of another recording.

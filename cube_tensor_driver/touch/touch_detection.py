@@ -332,7 +332,12 @@ class Touch:
         self._margin[cubes] += self._held[cubes] * margin
 
     def _use_pads(self, cubes: Index, left_out: PadMasks) -> None:
-        """Start the slow parts of cubes again, because the pads in use have changed."""
+        """Start the slow parts (averages that follow slow drift) of cubes with other pads again.
+
+        Args:
+            cubes: Indices (n,) of the cubes whose pads in use have changed.
+            left_out: Bit masks (n,) of the pads that are not in use now.
+        """
         self._restart(cubes)
         self._left_out[cubes] = left_out
         for cube, mask in zip(cubes.tolist(), left_out.tolist(), strict=True):

@@ -445,7 +445,7 @@ class ContactTracker:
         Args:
             home: Index of the cube around which the skin is laid flat.
             estimate: Force and position of the contact, with variances, on the flattened skin.
-            is_refined: Whether the estimate counts as refined.
+            is_refined: Value of `TrackedContact.refined`.
         """
         inverse = self._inverse
         places, angles = inverse.unroll(home, slice(None))

@@ -19,9 +19,9 @@ contact, divided by the largest pressure on the skin. The pressure must also exc
 threshold."""
 
 RELEASE_FRACTION = 0.75
-"""Factor by which the thresholds of the pressure (relative and absolute) are lower for points that
-belonged to a contact in the previous scan (set of values of all cubes). This hysteresis keeps noise
-from changing the regions of contact in every scan."""
+"""Thresholds of the pressure (relative and absolute) for points that belonged to a contact in the
+previous scan (set of values of all cubes), divided by the thresholds for other points. This
+hysteresis keeps noise from changing the regions of contact in every scan."""
 
 JOIN_PITCHES = 1.25
 """Largest distance of two regions of contact, divided by the pitch (distance of neighbouring

@@ -43,7 +43,7 @@ assumed noise includes errors of the pads' gains, which are proportional to the 
 
 MAX_OTHERS_CHANGE = 0.3
 """Change of the stress that other regions cause in the cubes of a fit on nodes, above which the
-region is fitted again: mean square of the whitened change since the fit.
+region is fitted again. It is the mean square of the change since the fit, in units of the noise.
 
 The first fits of regions that begin together each subtract an inexact estimate of the stress that
 the other regions cause. A narrow prior that was found with this estimate (`NodeFit.sharpen`) would
@@ -491,7 +491,7 @@ class TrackedRegion:
                 self.store_response()
 
     def store_response(self) -> None:
-        """Store the response of the cubes of the fit, which the fit predicts."""
+        """Store the response to this region that its fit predicts for the cubes of the fit."""
         if self.fit is not None:
             self.response[self.fit.values.cubes] = self.fit.explained
 
