@@ -334,8 +334,8 @@ class SurfaceInverse:
         Errors that differ little from those in use (`MIN_ERROR_CHANGE`) are ignored.
 
         Args:
-            errors: Errors (cubes, 15, K) by K independent causes, in Pa and Pa/m, as from
-                `Reconstructor.errors`; None: there are none.
+            errors: Errors (cubes, 15, K) in Pa and Pa/m, as from `Reconstructor.errors`: one
+                standard deviation of the effect of each of K independent causes. None: no errors.
         """
         if errors is None:
             errors = np.zeros((len(self.observed), len(COMPONENTS), 0))

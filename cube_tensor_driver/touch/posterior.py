@@ -45,9 +45,10 @@ WINDOW_CUBES = 25
 5 x 5 on a square grid."""
 
 INNER_CUBES = 13
-"""Number of inner cubes, those nearest to the centre of a window. From them, the scale of the prior
-and missing values of the centre cube are computed. With all 25 cubes of a window, the precision
-matrices P (inverse covariances of the values) would take most of the memory."""
+"""Number of inner cubes: those nearest to the centre of a window (`WINDOW_CUBES`). The scale of the
+prior and missing values of the centre cube are computed from their values. With all 25 cubes of a
+window, the precision matrices P (inverse covariances of the values) would take most of the memory.
+"""
 
 MODEL_ERROR = 0.01
 """Standard deviation of the error that inexact calibrations and an inexact depth of the cubes cause

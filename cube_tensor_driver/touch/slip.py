@@ -126,7 +126,7 @@ since this update."""
 MAX_SHIFT_DEPTHS = 0.2
 """Shift of a contact, divided by the depth of the cubes' centres below the surface, after which the
 derivatives of the cubes' values by the contact's force and position are computed again. The shift
-is counted from the position for which they hold. `MIN_SHIFT_DEPTHS` must be exceeded, too."""
+is counted from where the present derivatives hold. `MIN_SHIFT_DEPTHS` must be exceeded, too."""
 
 MIN_SHIFT_DEPTHS = 0.1
 """Shift of a contact since the last fit of the contact tracker, divided by the depth of the cubes'
@@ -146,9 +146,9 @@ changes with the force."""
 
 MAX_JUMP = 0.6
 """Change of the force of a contact since the derivatives of the cubes' values by its force and
-position were computed, divided by the force, above which the motion of the contact is unknown. As
-they are computed again above `MAX_FORCE_CHANGE`, only sudden changes, as of a body that bounces,
-are so large. A linear extrapolation gives no useful position then."""
+position were computed, divided by the force, above which the motion of the contact is unknown.
+Because the derivatives are computed again above `MAX_FORCE_CHANGE`, only a sudden change, as of a
+body that bounces, exceeds this limit. Linear extrapolation then gives no useful position."""
 
 MAX_LINEARISATIONS = 2
 """Largest number of contacts per scan (set of values of all cubes) for which the derivatives of the

@@ -38,9 +38,9 @@ typical force of a touch. A smaller one would reduce the error due to noise, and
 due to the unknown position of the load."""
 
 OTHER_FORCE_DEVIATION = 0.03
-"""Prior standard deviation t, in N, of each component of the forces of other loads. If it were
-larger, other loads would change the estimate less, but noise and the unknown position would change
-it more."""
+"""Prior standard deviation t, in N, of each component of the forces of other loads, which are
+farther away than the load whose force is estimated. If it were larger, other loads would change the
+estimate less, but noise and the unknown position would change it more."""
 
 MAX_PITCHES = 1.0
 """Largest distance of the load from the cube along x and along y, in pitches (distances of

@@ -62,7 +62,7 @@ class ContactSum(NamedTuple):
         sizes: Radii (q,) in m.
         forces: Forces (3, q) in N, along x, y and z.
         root: Square root R (3, q, n) of the covariance of the forces, in N. With its first two axes
-            joined, R R' is the covariance (3 q, 3 q); n is at most 3 q.
+            joined, R R' is the covariance (3 q, 3 q).
     """
 
     places: Array

@@ -46,7 +46,7 @@ the pressure distribution of a contact.
 
 To a Hertz contact of radius a, the flatness adds a multiple of the following difference: this
 contact minus a mixture of Hertz contacts of the radii a exp(h) and a exp(-h) with the same force,
-centre and second moment. It moves pressure from the centre to the rim. A Hertz contact has
+centre and second moment. This moves pressure from the centre to the rim. A Hertz contact has
 flatness 0, a rigid flat punch flatness 1.
 """
 

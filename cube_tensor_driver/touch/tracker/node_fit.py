@@ -168,7 +168,8 @@ class NodeFit:
             covariance of the forces.
         score: -2 ln of the evidence, up to a constant.
         is_solved: Whether `solve` was called.
-        is_settled: Whether `settle` was called after the last `solve` or `sharpen`.
+        is_settled: Whether `settle` was called after the last `solve`, and after the last `sharpen`
+            that replaced the fit.
         is_sharp: Whether `sharpen` has found that a narrower prior has no greater evidence.
     """
 

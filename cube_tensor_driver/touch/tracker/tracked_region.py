@@ -98,9 +98,9 @@ which the skin is laid flat for the fit, in pitches (distances of neighbouring c
 distance, the cube nearest to the contacts becomes the home cube."""
 
 MAX_STALE_CHANGE = 0.06
-"""Relative change of a region's contacts from which on the stress that they cause in distant cubes
-is computed again, divided by the relative standard deviation of this stress (`FIT_ERROR`,
-`START_ERROR`).
+"""Ratio from which on the stress that the contacts of a region cause in distant cubes is computed
+again: the relative change of the contacts, divided by the relative standard deviation of this
+stress (`FIT_ERROR`, `START_ERROR`).
 
 The relative change is the larger one of two ratios: the shift of the contacts divided by the
 distance of the nearest other region, and the change of force divided by the largest force.
