@@ -125,7 +125,7 @@ def effort(request: pytest.FixtureRequest) -> int:
 @pytest.fixture
 def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """`./cube reprocess` without worker processes, each of which takes half a second to start."""
-    name = "cube_tensor_driver.bags.reprocess.all_bags.workers"
+    name = "cube_tensor_driver.bags.reprocess.all_bags.start_workers"
     monkeypatch.setattr(name, lambda *_: ThreadPoolExecutor(1))
 
 

@@ -359,7 +359,7 @@ class McapWriter:
         """
         # MCAP allows no metadata record within a chunk, so the current chunk is completed first.
         self.flush()
-        self._writer.add_metadata(ROSBAG2_RECORD, rosbag2_metadata(summary))
+        self._writer.add_metadata(ROSBAG2_RECORD, make_rosbag2_metadata(summary))
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._stream.close()
 

@@ -174,7 +174,7 @@ def make_message(kind: str, **fields: object) -> object:
 
 
 def serialise(kind: str, message: object) -> bytes:
-    """Return the bytes (CDR) of a message that `make_message` made or `Bag.decoded` read."""
+    """Return the bytes (CDR) of a message that `make_message` made or `Bag.read_decoded` read."""
     return bytes(make_typestore().serialize_cdr(message, kind))
 
 
@@ -276,7 +276,7 @@ class Bag:
         names = {one.topic for one in self.connections if one.msgtype == msgtype}
         return sorted(names)
 
-    def skin_prefix(self) -> str:
+    def find_skin_prefix(self) -> str:
         """Return the prefix, ending in "/", of the topics of the only skin in the bag.
 
         Raises:
@@ -371,7 +371,7 @@ class Bag:
             except (zstandard.ZstdError, MessageError) as error:
                 self.skip(file.connections[channel].topic, time_ns, error)
 
-    def decoded(self, topics: set[str]) -> Iterator[tuple[int, object]]:
+    def read_decoded(self, topics: set[str]) -> Iterator[tuple[int, object]]:
         """Read messages as objects, in the order of recording; damaged ones are left out.
 
         Yields:
@@ -417,7 +417,7 @@ class Bag:
             )
         self.skipped[topic] += count
 
-    def infos(self, topic: str) -> list[SkinInfo]:
+    def read_infos(self, topic: str) -> list[SkinInfo]:
         """Return the SkinInfo messages (cubes, calibrations, rest frequencies) of a topic.
 
         Messages that are damaged are left out.
@@ -425,7 +425,7 @@ class Bag:
         Raises:
             BagError: No message can be read, or all have another version than `VERSION`.
         """
-        read: list[tuple[int, SkinInfo]] = list(self.decoded({topic}))
+        read: list[tuple[int, SkinInfo]] = list(self.read_decoded({topic}))
         if not read:
             raise BagError(
                 f"{self.path}: no message on {topic} that can be read: the bag does not say what "
@@ -534,7 +534,7 @@ class Bag:
         shape: tuple[int, bytes] = 0, b""
         room = 0
         for _, stored in self._read_stored({topic}):
-            for times_ns, messages in stored.equally_long():
+            for times_ns, messages in stored.group_by_length():
                 first = messages[0].tobytes()
                 new_shape = len(first), codec.shape_bytes(first)
                 begin = 0
@@ -605,7 +605,7 @@ def _join_batch(parts: Sequence[tuple[AnyArray, Times]]) -> Iterator[tuple[AnyAr
         yield np.concatenate(messages), np.concatenate(times_ns)
 
 
-def message_fields(msgtype: str) -> Fielddefs:
+def list_message_fields(msgtype: str) -> Fielddefs:
     """Return name and kind of each field of a message type, as the library rosbags states them.
 
     The list is empty if the type is unknown.
@@ -628,7 +628,7 @@ def _find_differing_type(msgtype: str, definition: str) -> str:
     """
     # Only fields are compared; constants of a definition do not change a message's bytes.
     for name, (_, fields) in get_types_from_msg(definition, msgtype).items():
-        if name.startswith(PACKAGE) and list(fields) != message_fields(name):
+        if name.startswith(PACKAGE) and list(fields) != list_message_fields(name):
             return name
     return ""
 

@@ -141,7 +141,7 @@ class CompensationReader:
         """
         topics = {self._topic} if self.is_recorded else set()
         message: SkinCompensation
-        for time_ns, message in self._bag.decoded(topics):
+        for time_ns, message in self._bag.read_decoded(topics):
             at_ns = stamp_ns(message)
             try:
                 motion = read_motion(message, at_ns)

@@ -161,11 +161,11 @@ def find_skin_infos(bag: Bag, topic: str) -> list[SkinInfo]:
     skin = topic.removesuffix("frequencies")
     driver_topic = f"{skin}driver/info"
     try:
-        infos = bag.infos(f"{skin}info")
+        infos = bag.read_infos(f"{skin}info")
     except BagError:
         if driver_topic not in bag.topics(INFO):
             raise
-        infos = bag.infos(driver_topic)
+        infos = bag.read_infos(driver_topic)
     reconstructed = [info for info in infos if info.sender == "reconstruction"]
     return reconstructed or infos
 

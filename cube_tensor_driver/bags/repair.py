@@ -56,7 +56,7 @@ from .mcap_file import (
     McapReader,
     parse_record,
     read_chunk,
-    rosbag2_metadata,
+    make_rosbag2_metadata,
     summarise,
 )
 from .metadata import FILE_NAME, SUFFIXES, read_metadata, write_metadata
@@ -340,7 +340,7 @@ def _salvage(path: Path) -> _Salvaged:
     with path.open("rb") as stream:
         if stream.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
             raise BagError(f"{path}: does not begin as an MCAP file does; nothing can be read")
-        for opcode, start, content in _records(stream):
+        for opcode, start, content in _read_records(stream):
             end = start + RECORD_HEAD.size + len(content)
             if opcode in (Opcode.DATA_END, Opcode.FOOTER):
                 break
@@ -353,7 +353,7 @@ def _salvage(path: Path) -> _Salvaged:
                     chunk = None
                     read, data = read_chunk(content)
                     counts = Counter()
-                    for kind, _, record in _records(BytesIO(data)):
+                    for kind, _, record in _read_records(BytesIO(data)):
                         if kind == Opcode.MESSAGE:
                             counts[int.from_bytes(record[:2], "little")] += 1
                         salvaged.note_definition(kind, record)
@@ -411,7 +411,7 @@ def _encode_summary(salvaged: _Salvaged, name: str) -> bytes:
     index.statistics = statistics
     # rosbag2 reads no messages from a file without this metadata record, although it takes the
     # topics from the summary.
-    about = rosbag2_metadata(summarise(name, index))
+    about = make_rosbag2_metadata(summarise(name, index))
     metadata = Metadata(ROSBAG2_RECORD, about)
     metadata_length = len(_encode_record([metadata]))
     metadata_index = MetadataIndex(salvaged.end, metadata_length, ROSBAG2_RECORD)
@@ -436,7 +436,7 @@ def _encode_summary(salvaged: _Salvaged, name: str) -> bytes:
     return data_end + summary + footer + checksum + MCAP_MAGIC
 
 
-def _records(stream: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
+def _read_records(stream: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
     """Yield the complete records of an MCAP file, beginning at the stream's position.
 
     Reading stops at a record whose length exceeds the rest of the file.

@@ -92,7 +92,7 @@ class BagSource:
         Raises:
             BagError: The bag is damaged.
         """
-        for segment in self.segments():
+        for segment in self.read_segments():
             yield segment.messages.rows
 
     def statistics(self) -> dict[str, object]:
@@ -120,7 +120,7 @@ class BagSource:
             count,
         )
 
-    def segments(self, *, use_health: bool = False) -> Iterator[Segment]:
+    def read_segments(self, *, use_health: bool = False) -> Iterator[Segment]:
         """Yield all messages in the order of recording, with their rows (samples of cubes).
 
         Each segment has successive messages with the same cubes, SkinInfo (calibrations and rest
@@ -229,7 +229,7 @@ def open_bag(path: Path | str, topic: str | None = None) -> BagSource:
     try:
         topics = bag.topics(FREQUENCIES)
         if topic is None:
-            topic = f"{bag.skin_prefix()}frequencies"
+            topic = f"{bag.find_skin_prefix()}frequencies"
         elif topic not in topics:
             found = ", ".join(topics) or "none"
             raise BagError(f"{path}: no frequencies on {topic}; there are {found}")

@@ -55,7 +55,7 @@ class StoredMessages:
             self.channel[chosen],
         )
 
-    def equally_long(self) -> Iterator[tuple[Times, AnyArray]]:
+    def group_by_length(self) -> Iterator[tuple[Times, AnyArray]]:
         """Divide the messages into groups of successive messages of equal length.
 
         Yields:

@@ -86,7 +86,7 @@ def last_diagnostics(bag: Bag) -> list[DiagnosticStatus]:
     last = {}
     topics = set(bag.topics(DIAGNOSTICS_TYPE))
     message: DiagnosticArray
-    for _, message in bag.decoded(topics):
+    for _, message in bag.read_decoded(topics):
         for status in message.status:
             last[status.name] = status
     return [last[name] for name in sorted(last)]

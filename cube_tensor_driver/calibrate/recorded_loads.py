@@ -223,7 +223,7 @@ def _read_reference(
     if msgtype == BATCH_TYPE:
         stamp_ns, values = _read_batches(bag, topic, number)
     elif msgtype in (WRENCH_TYPE, TENSOR_TYPE):
-        entries = bag.decoded({topic})
+        entries = bag.read_decoded({topic})
         messages: list[WrenchStamped | StressTensorStamped] = [message for _, message in entries]
         stamps = [header_stamp_ns(message) for message in messages]
         stamp_ns = np.array(stamps, np.int64)

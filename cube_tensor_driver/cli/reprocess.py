@@ -84,7 +84,7 @@ def run(options: argparse.Namespace) -> int:
         make_jobs,
         remove_without_results,
         reprocess_all,
-        workers,
+        start_workers,
         write_recipe,
     )
     from ..core.errors import CubeError
@@ -108,7 +108,7 @@ def run(options: argparse.Namespace) -> int:
 
     failed = 0
     try:
-        with workers(options.jobs, len(waiting)) as executor, progress_bar() as report:
+        with start_workers(options.jobs, len(waiting)) as executor, progress_bar() as report:
             results = reprocess_all(waiting, executor)
             for done, (job, result) in enumerate(results, 1):
                 report(done, len(waiting), "reprocessing")

@@ -60,7 +60,7 @@ class ImageStream:
         """
         self._where = f"{bag.path}: {topic}"
         self._shape = shape
-        self._unread = bag.decoded({topic})
+        self._unread = bag.read_decoded({topic})
         self._next: RawImage | CompressedImage | None = self._read()
         height, width, bands = shape
         black = Image.new(BAND_MODES[bands - 1], (width, height))

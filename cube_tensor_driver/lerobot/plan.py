@@ -300,7 +300,7 @@ def _read_marks(bag: Bag, topic: str) -> tuple[Times, list[str]]:
         )
     times_ns, tasks = [], [""]
     mark: String
-    for time_ns, mark in bag.decoded({topic}):
+    for time_ns, mark in bag.read_decoded({topic}):
         times_ns.append(time_ns)
         tasks.append(mark.data.strip())
     if not any(tasks):

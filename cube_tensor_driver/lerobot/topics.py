@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from rosbags.interfaces import Nodetype
 
-from ..bags.read import Bag, message_fields, stamp_ns
+from ..bags.read import Bag, list_message_fields, stamp_ns
 from ..core.arrays import Single, Times
 from ..core.errors import BagError
 from ..messages.types import PACKAGE
@@ -77,7 +77,7 @@ class Topic:
             for _, numbers in _read_numbers(bag, self):
                 self.names |= dict.fromkeys(numbers)
         elif self.shape == Topic.shape:
-            for _, message in bag.decoded({self.name}):
+            for _, message in bag.read_decoded({self.name}):
                 _, self.shape = encode(message, f"{bag.path}: {self.name}")
                 return
 
@@ -155,7 +155,7 @@ def find_topics(paths: Sequence[Path], choices: Choices) -> list[Topic]:
     wanted = {topic for topic in named if topic}
     for path in paths:
         with Bag(path) as bag:
-            frequencies = choices.frequencies or f"{bag.skin_prefix()}frequencies"
+            frequencies = choices.frequencies or f"{bag.find_skin_prefix()}frequencies"
             cubes = frequencies.removesuffix("frequencies") + "cubes/"
             for one in sorted(bag.connections, key=attrgetter("topic")):
                 # Topics of single cubes are left out: the stress of the skin has their numbers.
@@ -208,7 +208,7 @@ def _is_usable(msgtype: str) -> bool:
 def _read_numbers(bag: Bag, topic: Topic) -> Iterator[tuple[int, dict[str, float]]]:
     """Yield the stamp, in ns, and the numbers by their names of each message on a topic."""
     paths = _number_paths(topic.msgtype)
-    messages: Iterator[tuple[int, JointState | WrenchStamped]] = bag.decoded({topic.name})
+    messages: Iterator[tuple[int, JointState | WrenchStamped]] = bag.read_decoded({topic.name})
     for _, message in messages:
         if topic.msgtype == JOINT_STATE_TYPE:
             numbers = _find_joint_numbers(message, f"{bag.path}: {topic.name}")
@@ -229,7 +229,7 @@ def _number_paths(msgtype: str) -> list[str]:
     The list is empty if the type has no header (and therefore no stamp), contains a list of
     variable length, or belongs to this package.
     """
-    fields = message_fields(msgtype)
+    fields = list_message_fields(msgtype)
     if not fields or fields[0][1] != HEADER_KIND or msgtype.startswith(PACKAGE):
         return []
     paths = list(_nested_paths(fields[1:], ""))
@@ -253,7 +253,7 @@ def _nested_paths(fields: Fielddefs, prefix: str) -> Iterator[str | None]:
         # For a list of fixed length, the second element of its kind is (kind of element, length).
         kind = field_kind[1][0] if field_kind[0] == Nodetype.ARRAY else field_kind
         if field_kind[0] == Nodetype.NAME:
-            yield from _nested_paths(message_fields(field_kind[1]), f"{prefix}{name}.")
+            yield from _nested_paths(list_message_fields(field_kind[1]), f"{prefix}{name}.")
         elif kind[0] != Nodetype.BASE:
             yield None
         elif kind[1][0] != "string":

@@ -235,7 +235,7 @@ def test_reprocessed_is_recorded_to_the_bit(tmp_path, storage):
     assert done.messages == 300 and done.rows == 300 * 16
     assert all_differing_bits(stress(path), stress(tmp_path / "out")) == 0
     with Bag(path) as one, Bag(tmp_path / "out") as other:
-        assert other.infos("/info")[0].calibrations == one.infos("/info")[0].calibrations
+        assert other.read_infos("/info")[0].calibrations == one.read_infos("/info")[0].calibrations
 
 
 def test_reprocess_needs_no_ros(bag, tmp_path):
@@ -346,7 +346,7 @@ def test_another_calibration_and_tare(bag, tmp_path, capsys, one_process):
         == 0
     )
     with Bag(tmp_path / "tared" / "bag") as made:
-        assert len(made.infos("/info")) == 1
+        assert len(made.read_infos("/info")) == 1
     record = stress(tmp_path / "tared" / "bag")[START_NS + 1_000_000_000]
     # rest is float64, the frequency float32: 6e-8 of it, as strain, times the modulus of 0.3 MPa
     # and the inversion
@@ -383,7 +383,7 @@ def test_calibrations_of_another_skin_file_go_by_the_names_of_cubes(
         assert np.array_equal(np.isnan(record.stress), unseen)
         assert np.all((np.abs(record.stress - expected) <= rounding) | unseen)
     with Bag(tmp_path / "out" / "bag") as made:
-        ids = [cube.calibration_id for cube in made.infos("/info")[0].cubes]
+        ids = [cube.calibration_id for cube in made.read_infos("/info")[0].cubes]
     assert len(set(ids)) == 2 and ids.count(ids[3]) == 1
     del data["cubes"][5]
     write_yaml(tmp_path / "skin.yaml", data)
@@ -584,7 +584,7 @@ def test_another_version_is_refused(tmp_path):
             bytes(make_typestore().serialize_cdr(info_of(skin, pipeline, 1, version=7), INFO)),
         )
     with Bag(tmp_path / "bag") as bag, pytest.raises(BagError, match="/info has version 7; this"):
-        bag.infos("/info")
+        bag.read_infos("/info")
 
     old = tmp_path / "old.mcap"
     with old.open("wb") as file:

@@ -169,8 +169,8 @@ def test_recorded_is_published_and_reprocessed_is_live(running, tmp_path):
     assert "/frequencies" in end(other) and other.returncode == 0
     assert recorder.returncode == 0 and "/frequencies" in output, output
     with Bag(path) as bag:
-        assert {info.sender for info in bag.infos("/info")} == {"reconstruction"}
-        assert all(cube.uid for cube in bag.infos("/info")[-1].cubes)
+        assert {info.sender for info in bag.read_infos("/info")} == {"reconstruction"}
+        assert all(cube.uid for cube in bag.read_infos("/info")[-1].cubes)
         recorded = [
             int(stamp)
             for messages, _ in bag.frequencies("/frequencies")
@@ -213,8 +213,8 @@ def test_ros2_bag_records_what_is_published(running, tmp_path):
         and len(recorded) > 50
     )
     with Bag(path) as bag:
-        assert {info.sender for info in bag.infos("/info")} == {"reconstruction"}
-        assert all(cube.uid for cube in bag.infos("/info")[-1].cubes)
+        assert {info.sender for info in bag.read_infos("/info")} == {"reconstruction"}
+        assert all(cube.uid for cube in bag.read_infos("/info")[-1].cubes)
     reprocess(ReprocessJob(path, tmp_path / "out", "bag"))
     live, again = stress(path), stress(tmp_path / "out")
     common = live.keys() & again.keys()

@@ -134,7 +134,7 @@ def test_reprocessed_info_says_what_was_used(tmp_path):
     used = skin.calibrations[0]
     reprocess(ReprocessJob(bag, tmp_path / "out", "bag", Overrides(skin=skin)))
     with Bag(bag) as recorded, Bag(tmp_path / "out") as made:
-        (before,), (after,) = recorded.infos("/info"), made.infos("/info")
+        (before,), (after,) = recorded.read_infos("/info"), made.read_infos("/info")
     assert (after.sender, after.name, after.version) == ("reconstruction", skin.name, 4)
     assert after.header == before.header and after.cubes[3].pose == before.cubes[3].pose
     assert list(after.calibration_ids) == [used.id]

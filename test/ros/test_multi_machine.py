@@ -148,7 +148,7 @@ def rows(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Cube, sequence and time of arrival (ns) of all rows of `stress`."""
     with Bag(path) as bag:
         (topic,) = bag.topics(STRESS)
-        messages = [(message, time_ns) for time_ns, message in bag.decoded({topic})]
+        messages = [(message, time_ns) for time_ns, message in bag.read_decoded({topic})]
     cube, sequence = (
         np.concatenate([getattr(one, name) for one, _ in messages]) for name in ("cube", "sequence")
     )
@@ -161,7 +161,7 @@ def rows(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def lost_on_the_way(path: Path) -> int:
     """What the reconstruction said last of messages lost."""
     with Bag(path) as bag:
-        arrays = [message for _, message in bag.decoded({"/diagnostics"})]
+        arrays = [message for _, message in bag.read_decoded({"/diagnostics"})]
     said = [
         int(pair.value)
         for array in arrays

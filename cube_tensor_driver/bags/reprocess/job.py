@@ -199,7 +199,7 @@ def reconstruct(
     number = -1
     ids: list[str] = []
     refused: CubeError | None = None
-    for segment in source.segments(use_health=use_health):
+    for segment in source.read_segments(use_health=use_health):
         if segment.number != number:
             number = segment.number
             current = settings[number]

@@ -72,7 +72,7 @@ def frequency_table(source: BagSource) -> pyarrow.Table:
     # Values that apply from the next row on: rest frequencies, states of creep and temperature.
     changes: dict[str, Array] = {}
     parts: list[pyarrow.Table] = []
-    for segment in source.segments(use_health=True):
+    for segment in source.read_segments(use_health=True):
         rows = segment.messages.rows
         changes |= segment.states
         if segment.number != number:
