@@ -15,7 +15,7 @@ from launch_ros.substitutions import ExecutableInPackage
 from cube_tensor_driver.config.output_files import make_temporary_folder
 from cube_tensor_driver.config.skin import Skin
 from cube_tensor_driver.config.urdf import make_skin_urdf
-from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
+from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, list_skin_processes
 from cube_tensor_driver.ros.launching import (
     DEMO_LOAD,
     SkinArguments,
@@ -117,7 +117,7 @@ def start_skin(context: LaunchContext) -> list[Action]:
             noise=None,
             imperfections=given.imperfections,
         )
-    processes = skin_processes(
+    processes = list_skin_processes(
         given.config,
         composed="composed" in wanted,
         markers=bool(wanted & {"markers", "rviz"}),

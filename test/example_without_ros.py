@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 
 import cube_tensor_driver as ctd
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 
 CHECKOUT = Path(__file__).resolve().parents[1]
-SKIN = package_data() / "config" / "skin_demo.yaml"
+SKIN = find_package_data() / "config" / "skin_demo.yaml"
 SCANS = 50
 
 

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.device.wire.decoder import Decoder
 from cube_tensor_driver.device.wire.protocol import Command, Hello, Request, Sample, encode
 
-SINGLE = package_data() / "config" / "cube.yaml"
+SINGLE = find_package_data() / "config" / "cube.yaml"
 """The skin of one cube with 8 pads, on the link hub0."""
 HUB_UID, CUBE_UID, PERIOD_US = 0xAB, 0xCD, 10_000
 REST = np.full((1, 8), 100_000_000, "<u4")

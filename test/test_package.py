@@ -221,11 +221,11 @@ def test_every_dependency_is_declared_and_pinned():
 USES_ITS_DATA = """
 import cube_tensor_driver, cube_tensor_driver.core.pipeline
 from cube_tensor_driver.config.calibration import read_calibration
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import read_skin
 print(cube_tensor_driver.__file__)
-print(package_data())
-print(len(read_skin(package_data() / "config" / "skin_demo.yaml").cubes))
+print(find_package_data())
+print(len(read_skin(find_package_data() / "config" / "skin_demo.yaml").cubes))
 from cube_tensor_driver.device.wire.native import wire
 print(wire and wire.__file__)
 """

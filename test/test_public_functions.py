@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 import cube_tensor_driver as ctd
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.touch.surface import Contact
 from cube_tensor_driver.touch.touch_detection import NO_TOUCHES
 from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker, TrackedContact
 
-FILE = package_data() / "config" / "skin_demo.yaml"
+FILE = find_package_data() / "config" / "skin_demo.yaml"
 SKIN = ctd.read_skin(FILE)
 
 

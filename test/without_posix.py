@@ -53,9 +53,9 @@ def main(bag: Path, out: Path) -> None:
             # Other libraries may be missing here: those of ROS and of extras.
             assert error.name not in MODULES, f"{found.name}: {error}"
 
-    from cube_tensor_driver.config.package_data import package_data
+    from cube_tensor_driver.config.package_data import find_package_data
 
-    skin = ctd.read_skin(package_data() / "config" / "skin_demo.yaml")
+    skin = ctd.read_skin(find_package_data() / "config" / "skin_demo.yaml")
     for source in (ctd.simulate(skin), ctd.open_bag(bag)):
         with source:
             reconstruct = ctd.Reconstructor(source.skin)

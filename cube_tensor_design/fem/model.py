@@ -130,7 +130,7 @@ def read_model(name: str | None) -> Model:
         return _build_model({}, Path())
     path = find_shipped("fem/*.yaml", name, Path(), "a model file, or one of the shipped models")
     data = read_yaml(path) or {}
-    for _, mistake in _SCHEMA.mistakes(data):
+    for _, mistake in _SCHEMA.find_mistakes(data):
         raise ConfigError(f"{path}: {mistake}")
     try:
         return _build_model(data, path.parent)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cube_tensor_driver.config.calibration import read_calibration
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.defaults import POISSONS_RATIO, SURFACE_DEPTH
@@ -40,7 +40,7 @@ PAIR = ("+z-x", "+z+x")
 
 def read_planar_calibration() -> Calibration:
     """Return the calibration of planar cubes in the package."""
-    return read_calibration(package_data() / "config" / "calibration" / "planar.yaml")
+    return read_calibration(find_package_data() / "config" / "calibration" / "planar.yaml")
 
 
 def make_simple_loads(calibration: Calibration) -> dict[str, Array]:

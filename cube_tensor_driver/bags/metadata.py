@@ -20,7 +20,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from ..config.input_files import read_bounded
-from ..config.package_data import package_data
+from ..config.package_data import find_package_data
 from ..config.yaml import parse_yaml, write_yaml
 from ..core.errors import BagError, ConfigError
 from ..messages.types import PACKAGE
@@ -164,7 +164,7 @@ def make_typestore() -> Typestore:
     """Return the message types of ROS 2 Jazzy and of the installed version of this package."""
     store = get_typestore(Stores.ROS2_JAZZY)
     types: Typesdict = {}
-    folder = package_data() / "msg"
+    folder = find_package_data() / "msg"
     for path in sorted(folder.glob("*.msg")):
         name = f"{PACKAGE}/msg/{path.stem}"
         types |= get_types_from_msg(path.read_text("utf-8"), name)

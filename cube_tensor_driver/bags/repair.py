@@ -54,9 +54,9 @@ from .mcap_file import (
     RECORD_HEAD,
     ROSBAG2_RECORD,
     McapReader,
+    make_rosbag2_metadata,
     parse_record,
     read_chunk,
-    make_rosbag2_metadata,
     summarise,
 )
 from .metadata import FILE_NAME, SUFFIXES, read_metadata, write_metadata

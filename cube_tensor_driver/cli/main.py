@@ -192,11 +192,11 @@ def version() -> str:
     """
     from importlib import metadata
 
-    from ..config.package_data import package_data
+    from ..config.package_data import find_package_data
     from ..core.errors import ConfigError
 
     try:
-        text = (package_data() / "package.xml").read_text(encoding="utf-8")
+        text = (find_package_data() / "package.xml").read_text(encoding="utf-8")
         return str(re.findall(r"<version>(.+?)</version>", text)[0])
     except (ConfigError, OSError, IndexError):
         return metadata.version("cube_tensor_driver")

@@ -202,7 +202,7 @@ def read_contact_options(options: argparse.Namespace) -> ContactOptions | None:
         if name not in known:
             raise ConfigError(f"--contacts {text}: use NAME:=VALUE with one of {', '.join(known)}")
         values[name] = known[name].parse(value)
-        refusal = known[name].refusal(values[name])
+        refusal = known[name].find_refusal(values[name])
         if refusal:
             raise ConfigError(f"--contacts {text}: {refusal}")
     rate = values.pop("rate")

@@ -11,7 +11,7 @@ from ..core.calibration import Calibration
 from ..core.errors import CalibrationError, ConfigError
 from ..core.layout import LAYOUTS, Layout, find_layout
 from .output_files import YAML_SUFFIXES
-from .package_data import find_shipped, package_data
+from .package_data import find_package_data, find_shipped
 from .yaml import read_yaml, to_yaml, write_yaml
 
 
@@ -95,7 +95,7 @@ def find_shipped_calibration(layout: Layout) -> Calibration | None:
     built_in = LAYOUTS.get(layout.name)
     if built_in is None or not built_in.same_as(layout):
         return None
-    path = package_data() / "config" / "calibration" / f"{layout.name}.yaml"
+    path = find_package_data() / "config" / "calibration" / f"{layout.name}.yaml"
     # Which modes may be neglected depends on the application, so the user states it in his own
     # calibration file and the list in the package's file is dropped.
     return replace(read_calibration(path), neglect=())

@@ -205,7 +205,7 @@ def read_script(path: Path) -> Script:
             of the first mistake, the value found there and the values that are allowed.
     """
     data = read_yaml(path)
-    for _, mistake in _SCHEMA.mistakes(data):
+    for _, mistake in _SCHEMA.find_mistakes(data):
         raise ConfigError(f"{path}: {mistake}")
 
     period = data.get("period")

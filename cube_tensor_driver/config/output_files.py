@@ -31,7 +31,7 @@ def write_atomically(path: Path) -> Iterator[Path]:
     Raises:
         ConfigError: The file cannot be written, or `path` is a folder or a device.
     """
-    with _temporary_file(path) as temporary:
+    with _make_temporary_file(path) as temporary:
         yield temporary
         # Without this call, a loss of power after the renaming can leave an empty file, because a
         # file system may store the new name before the content.
@@ -46,7 +46,7 @@ def check_writable(path: Path) -> None:
     A temporary file is made in the same folder and removed. Checking permissions is not sufficient:
     the user root passes every such check, even for /proc and for read-only file systems.
     """
-    with _temporary_file(path):
+    with _make_temporary_file(path):
         pass
 
 
@@ -154,7 +154,7 @@ def make_temporary_folder(prefix: str) -> Path:
 
 
 @contextmanager
-def _temporary_file(path: Path) -> Iterator[Path]:
+def _make_temporary_file(path: Path) -> Iterator[Path]:
     """Yield the path of a new file in the folder of `path`; it is removed when the block ends.
 
     Raises:

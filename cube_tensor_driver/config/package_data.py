@@ -14,7 +14,7 @@ _NAME = "cube_tensor_driver"
 """Name of the ROS package, and of its folder below share/."""
 
 
-def package_data() -> Path:
+def find_package_data() -> Path:
     """Return the folder that holds config/ and launch/.
 
     In a checkout of the repository it is the top folder of the checkout, after an installation it
@@ -55,7 +55,7 @@ def find_shipped(
         ConfigError: The package has no file of this name and the path leads to none. The message
             lists the names in the package.
     """
-    shipped = package_data() / "config"
+    shipped = find_package_data() / "config"
     for path in (shipped / pattern.replace("*", name), folder / name):
         # os.path.isfile, unlike Path.is_file, is false for a name that is too long.
         if os.path.isfile(path):  # noqa: PTH113

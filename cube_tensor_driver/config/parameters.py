@@ -60,7 +60,7 @@ class Parameter(NamedTuple):
     def parse(self, text: str) -> Any:
         """Convert a text into a value of the parameter's type: bool, float or str.
 
-        If the parameter is a number but the text is not, the result is NaN. `refusal` reports it.
+        If the parameter is a number but the text is not, the result is NaN. `find_refusal` reports it.
         """
         if isinstance(self.default, bool):
             return text.lower() == "true"
@@ -71,7 +71,7 @@ class Parameter(NamedTuple):
         except ValueError:
             return math.nan
 
-    def refusal(self, value: Any) -> str:
+    def find_refusal(self, value: Any) -> str:
         """Return an error message if the parameter does not allow a value; "" if it does.
 
         Args:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .package_data import package_data
+from .package_data import find_package_data
 from .skin import Skin
 from .yaml import read_yaml
 
@@ -46,7 +46,7 @@ def make_rviz_view(skin: Skin) -> dict[str, object]:
     diagonal = float(np.linalg.norm(high - low))
     focal_point = (low + high) / 2
 
-    view: dict[str, Any] = read_yaml(package_data() / "rviz" / "skin.rviz")
+    view: dict[str, Any] = read_yaml(find_package_data() / "rviz" / "skin.rviz")
     manager = view["Visualization Manager"]
     manager["Global Options"]["Fixed Frame"] = skin.parent_frame
     displays = {display["Name"]: display for display in manager["Displays"]}

@@ -125,7 +125,7 @@ class Schema:
         number = base.TYPE_CHECKER.redefine("number", _is_finite_number)
         self._validator = jsonschema.validators.extend(base, type_checker=number)(schema)
 
-    def mistakes(self, data: object) -> list[tuple[KeyPath, str]]:
+    def find_mistakes(self, data: object) -> list[tuple[KeyPath, str]]:
         """Return all mistakes in plain values (mappings, lists, numbers, texts), sorted by key.
 
         Args:

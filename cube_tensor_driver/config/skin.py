@@ -247,7 +247,7 @@ def read_skin(path: str | Path, frame_prefix: str = "") -> Skin:
     skin, mistakes = check_skin(path)
     if skin is not None:
         parent_frame = frame_prefix + skin.parent_frame
-        for _, mistake in Schema(_FRAME).mistakes(parent_frame):
+        for _, mistake in Schema(_FRAME).find_mistakes(parent_frame):
             raise ConfigError(f"frame_prefix {frame_prefix!r}: {mistake.partition(': ')[2]}")
         return replace(skin, parent_frame=parent_frame, frame_prefix=frame_prefix)
     others = len(mistakes) - 1
@@ -286,7 +286,7 @@ def check_skin_data(
         The skin and an empty list, or None and the mistakes, one line each. If the JSON schema
         finds mistakes, only these are returned; otherwise those that concern several keys or files.
     """
-    mistakes = [line for _, line in _SCHEMA.mistakes(data)]
+    mistakes = [line for _, line in _SCHEMA.find_mistakes(data)]
     if mistakes or not isinstance(data, dict):
         return None, mistakes
     links = tuple(

@@ -99,7 +99,7 @@ def read_tare(folder: Path, uid: int, calibration: Calibration) -> StoredTare | 
     if not path.exists():
         return None
     data = read_yaml(path)
-    for _, mistake in _tare_schema(uid, calibration).mistakes(data):
+    for _, mistake in _tare_schema(uid, calibration).find_mistakes(data):
         raise ConfigError(f"{path}: {mistake}; tare again")
     try:
         # Times with and without a zone cannot be compared, so one without is taken as local time.

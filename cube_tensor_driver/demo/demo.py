@@ -15,12 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..config.grid import describe_grid
-from ..config.package_data import package_data
+from ..config.package_data import find_package_data
 from ..config.yaml import read_yaml, write_yaml
 from ..core.errors import ConfigError
 from ..processes.children import Children
 from ..processes.domain import is_domain_used
-from ..processes.skin_processes import VIEW, SimulatedHubs, skin_processes
+from ..processes.skin_processes import VIEW, SimulatedHubs, list_skin_processes
 from ..processes.stop_signals import INTERRUPTED, stop_event
 
 MAX_CUBES = 4096
@@ -102,7 +102,7 @@ def run_demo(settings: DemoSettings) -> int:
             noise=settings.noise,
             imperfections=settings.imperfections,
         )
-        processes = skin_processes(skin_file, rate=rate, simulated=hubs)
+        processes = list_skin_processes(skin_file, rate=rate, simulated=hubs)
         if settings.view:
             processes.append(VIEW)
         with Children(folder) as children:
@@ -152,7 +152,7 @@ def choose_skin_file(settings: DemoSettings, folder: Path) -> Path:
     if settings.cubes is not None:
         rate = settings.rate or DEFAULT_RATE
         return write_grid(folder / "skin.yaml", settings.cubes, rate)
-    return package_data() / "config" / "skin_demo.yaml"
+    return find_package_data() / "config" / "skin_demo.yaml"
 
 
 def write_grid(

@@ -28,7 +28,7 @@ class Usage:
             children: The child processes.
             names: Names of the child processes to measure, such as "driver".
         """
-        self._processes = {name: psutil.Process(children.pid(name)) for name in names}
+        self._processes = {name: psutil.Process(children.find_pid(name)) for name in names}
         self._start_s = time.monotonic()
         self._start_cpu_s = self._sum_cpu_seconds()
 

@@ -110,7 +110,7 @@ class Children:
         """Return the names of the processes that were started and that `end` has not ended yet."""
         return list(self._processes)
 
-    def pid(self, executable: str) -> int:
+    def find_pid(self, executable: str) -> int:
         """Return the process id of the child process with this executable."""
         return self._processes[executable].pid
 

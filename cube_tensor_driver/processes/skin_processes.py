@@ -111,7 +111,7 @@ class SimulatedHubs:
         )
 
 
-def skin_processes(
+def list_skin_processes(
     config: Path,
     *,
     composed: bool = False,

@@ -25,7 +25,7 @@ from launch_ros.utilities.namespace_utils import make_namespace_absolute, prefix
 
 from ..config.load_script import read_script
 from ..config.output_files import make_temporary_folder
-from ..config.package_data import package_data
+from ..config.package_data import find_package_data
 from ..config.parameters import DRIVER, RECONSTRUCTION
 from ..config.rviz import make_rviz_view
 from ..config.skin import Skin, read_skin
@@ -35,7 +35,7 @@ from ..device.live import make_link_configs
 from ..processes.skin_processes import Value
 from ..simulation.imperfections import read_imperfections
 
-_CONFIG = package_data() / "config"
+_CONFIG = find_package_data() / "config"
 """Folder of the configuration files that are installed with the package."""
 
 SINGLE_CUBE = _CONFIG / "cube.yaml"
@@ -47,7 +47,7 @@ DEMO_SKIN = _CONFIG / "skin_demo.yaml"
 DEMO_LOAD = _CONFIG / "load_demo.yaml"
 """Path of the load script of the demo, which states the forces on the simulated skin over time."""
 
-SKIN_LAUNCH = package_data() / "launch" / "skin.launch.py"
+SKIN_LAUNCH = find_package_data() / "launch" / "skin.launch.py"
 """Path of the launch file that starts the nodes of a skin."""
 
 RECORD_QOS = _CONFIG / "record_qos.yaml"
@@ -273,7 +273,7 @@ def check_arguments(
             continue
         parameter = PARAMETERS[name]
         parameters[name] = parameter.parse(text)
-        refusal = parameter.refusal(parameters[name])
+        refusal = parameter.find_refusal(parameters[name])
         if refusal:
             raise ConfigError(f"{name}:={text}: {refusal}")
     # This call raises an error if the argument `port` is set for a skin with several links.

@@ -329,7 +329,7 @@ class CubeNode(LifecycleNode):
             known = self._parameters_by_name.get(parameter.name)
             if known is None:
                 continue
-            reason = known.refusal(parameter.value)
+            reason = known.find_refusal(parameter.value)
             if not reason and self.is_configured and not known.live:
                 reason = (
                     f"parameter {known.name} cannot change while the node is configured: "

@@ -120,7 +120,7 @@ class Fault:
             ConfigError: A key or a value is wrong. The message names the key, the value and the
                 allowed values.
         """
-        for _, mistake in _SCHEMA.mistakes(data):
+        for _, mistake in _SCHEMA.find_mistakes(data):
             raise ConfigError(f"{place}: {mistake}")
         defaults: dict[str, Any] = {"kind": "", **vars(cls)}
         values = {}

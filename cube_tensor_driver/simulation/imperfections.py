@@ -180,7 +180,7 @@ class Imperfections:
         values = asdict(self)
         for name in _TABLES:
             values[name] = [list(row) for row in getattr(self, name)]
-        for _, mistake in _SCHEMA.mistakes(values):
+        for _, mistake in _SCHEMA.find_mistakes(values):
             raise ConfigError(mistake)
         for name in ("temperature", "air", "poses"):
             times = [time for time, *_ in getattr(self, name)]
@@ -209,7 +209,7 @@ def read_imperfections(path: Path) -> Imperfections:
         ConfigError: A key is unknown, or a value is wrong.
     """
     data = read_yaml(path)
-    for _, mistake in _SCHEMA.mistakes(data):
+    for _, mistake in _SCHEMA.find_mistakes(data):
         raise ConfigError(f"{path}: {mistake}")
     # Lists become tuples, because an instance of `Imperfections` is immutable.
     for name in _TABLES & data.keys():

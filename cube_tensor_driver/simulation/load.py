@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 import numpy as np
 
 from ..config.load_script import Action, Indenter, Script, interpolate_knots, read_script
-from ..config.package_data import package_data
+from ..config.package_data import find_package_data
 from ..config.skin import Skin
 from ..core.arrays import Array, Index
 from ..core.errors import ConfigError

@@ -101,12 +101,12 @@ def read_skin_of_hub(path: Path | None) -> tuple[Skin, HubCubes]:
     Raises:
         CubeError: The skin file cannot be used, or has other cubes than the emulated hub.
     """
-    from cube_tensor_driver.config.package_data import package_data
+    from cube_tensor_driver.config.package_data import find_package_data
     from cube_tensor_driver.config.skin import read_skin
     from cube_tensor_driver.core.errors import ConfigError
     from cube_tensor_driver.simulation.cubes import make_hub_cubes
 
-    skin = read_skin(path or package_data() / "config" / "skin_firmware.yaml")
+    skin = read_skin(path or find_package_data() / "config" / "skin_firmware.yaml")
     hubs = make_hub_cubes(skin)
     sizes = [(len(hub.members), hub.cubes.n_pads) for hub in hubs]
     if sizes != [EMULATED_HUB]:

@@ -18,11 +18,11 @@ from cube_tensor_driver.bags.metadata import make_typestore
 from cube_tensor_driver.bags.read import Bag
 from cube_tensor_driver.bags.reprocess.job import ReprocessJob, reprocess
 from cube_tensor_driver.bags.write import BagWriter
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.core.errors import BagError
 from cube_tensor_driver.messages.types import FREQUENCIES, INFO
 
-SKIN = package_data() / "config" / "skin_demo.yaml"
+SKIN = find_package_data() / "config" / "skin_demo.yaml"
 MESSAGES = 30
 
 

@@ -20,7 +20,7 @@ from cube_tensor_driver.bags.reprocess.job import reconstruct
 from cube_tensor_driver.bags.reprocess.recorded_reconstruction import RecordedReconstruction
 from cube_tensor_driver.bags.source import open_bag
 from cube_tensor_driver.bags.write import BagWriter
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.errors import BagError
 from cube_tensor_driver.core.pipeline import Pipeline
@@ -30,7 +30,7 @@ from cube_tensor_driver.core.status import STUCK
 from cube_tensor_driver.messages.codec import frequency_codec
 from cube_tensor_driver.messages.types import FREQUENCIES, INFO
 
-SKIN = package_data() / "config" / "skin_demo.yaml"
+SKIN = find_package_data() / "config" / "skin_demo.yaml"
 MESSAGES = 200
 TARED_FROM = 90
 

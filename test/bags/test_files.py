@@ -46,7 +46,7 @@ from cube_tensor_driver.bags.source import open_bag
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.cli.main import main
 from cube_tensor_driver.config.calibration import read_calibration, write_calibration
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.yaml import parse_yaml, read_yaml, write_yaml
 from cube_tensor_driver.core.errors import BagError
@@ -56,7 +56,7 @@ from cube_tensor_driver.core.rows import FrequencyRows, StressRows
 from cube_tensor_driver.core.status import PAD_FAULT, STAMP, STUCK
 from cube_tensor_driver.messages.types import FREQUENCIES, INFO, STRESS
 
-SKIN = package_data() / "config" / "skin_demo.yaml"
+SKIN = find_package_data() / "config" / "skin_demo.yaml"
 KEPT = ROOT / "test" / "data" / "bag"
 """A recording of hubs on a noisy line, made while their clock was set."""
 
@@ -614,7 +614,7 @@ def test_a_recorded_bag_can_be_read(tmp_path):
 def test_fit_from_a_bag(tmp_path, capsys):
     """A cube under known loads recovers its coefficients; by forces alone, what they do not tell is
     named."""
-    skin = read_skin(package_data() / "config" / "cube.yaml")
+    skin = read_skin(find_package_data() / "config" / "cube.yaml")
     calibration, area = skin.cubes[0].calibration, 1e-4
     modes, kind = calibration.modes, "cube_tensor_driver/msg/StressTensorStamped"
     pipeline = Pipeline([calibration], np.float32)

@@ -34,17 +34,17 @@ from cube_tensor_driver.bags.repair import repair
 from cube_tensor_driver.bags.reprocess.job import ReprocessJob, reprocess
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.cli.main import main
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.core.errors import BagError
 from cube_tensor_driver.messages.types import FREQUENCIES, INFO, STRESS
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 from cube_tensor_driver.processes.children import Children
-from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
+from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, list_skin_processes
 from cube_tensor_driver.ros.messages import to_ns
 from cube_tensor_driver.ros.qos import batch_profile
 from cube_tensor_driver.simulation.inject import inject
 
-SKIN = package_data() / "config" / "skin_demo.yaml"
+SKIN = find_package_data() / "config" / "skin_demo.yaml"
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 MADE_ANEW = ("--exclude-topics", "/stress")
 needs_ros2_bag = pytest.mark.skipif(
@@ -138,7 +138,7 @@ def own_signals() -> Iterator[None]:
 def running(ros, tmp_path):
     """A simulated skin of sixteen cubes, and a tester that listens."""
     with Children(tmp_path) as children:
-        for process in skin_processes(SKIN, simulated=SimulatedHubs(tmp_path / "ports")):
+        for process in list_skin_processes(SKIN, simulated=SimulatedHubs(tmp_path / "ports")):
             children.start(process)
         ros.heard = ros.listen(SkinStress, "stress", 1000)
         ros.wait(lambda: ros.heard)
@@ -196,7 +196,7 @@ def test_ros2_bag_records_what_is_published(running, tmp_path):
     """As docs/bags.md says. The bag has the info from before, every scan, and gives the same bits
     again."""
     path = tmp_path / "bag"
-    overrides = package_data() / "config" / "record_qos.yaml"
+    overrides = find_package_data() / "config" / "record_qos.yaml"
     options = ["--storage", "mcap", "-o", path, "--qos-profile-overrides-path", overrides]
     options += ["--topics", "/frequencies", "/stress", "/info"]
     heard = running.listen(SkinFrequencies, "frequencies", 1000)

@@ -19,9 +19,9 @@ from bag_maker import make_bag
 import cube_tensor_driver as ctd
 from conftest import ROOT
 from cube_tensor_driver.bags.reprocess.job import Overrides, ReprocessJob, reprocess
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 
-SKIN = package_data() / "config" / "skin_demo.yaml"
+SKIN = find_package_data() / "config" / "skin_demo.yaml"
 KEPT = ROOT / "test" / "data" / "bag"
 """A recording of hubs on a noisy line, which has lost messages and messages of few cubes."""
 

@@ -17,7 +17,7 @@ from cube_tensor_driver.browser.colouring import Colouring
 from cube_tensor_driver.browser.history import SampleRate
 from cube_tensor_driver.browser.scan import MAX_WAITING_MESSAGES, Scan, ScanSynchronizer
 from cube_tensor_driver.browser.surface_field import DEVIATION, FieldModel, SurfaceField
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.errors import BagError
 from cube_tensor_driver.core.modes import COMPONENTS
@@ -33,7 +33,7 @@ DEPTH = 0.004
 """Depth of the cubes' centres below the surface, in m."""
 PITCH = 0.01
 """Distance between neighbouring cubes, in m."""
-DEMO = read_skin(package_data() / "config" / "skin_demo.yaml")
+DEMO = read_skin(find_package_data() / "config" / "skin_demo.yaml")
 
 
 @pytest.fixture

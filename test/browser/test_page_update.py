@@ -28,7 +28,7 @@ from conftest import encoded
 from cube_tensor_driver.browser import page as page_module
 from cube_tensor_driver.browser.page import LEFT_WIDTH, RIGHT_WIDTH, Page, PageLayout
 from cube_tensor_driver.browser.viewer import MAX_STEP_S, Viewer
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import StressRows
@@ -42,7 +42,7 @@ from cube_tensor_driver.touch.surface import Contact
 from cube_tensor_driver.views import scene
 from workshop.bench.views import CAMERA
 
-SKIN = read_skin(package_data() / "config" / "skin_demo.yaml")
+SKIN = read_skin(find_package_data() / "config" / "skin_demo.yaml")
 N = len(SKIN.cubes)
 CHOSEN = 5
 # Of scan k: the chosen cube is under k steps of pressure, and the strongest contact has k steps of

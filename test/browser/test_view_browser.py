@@ -37,7 +37,7 @@ from websockets.sync.client import connect
 
 from conftest import ROOT, encoded, end
 from cube_tensor_driver.browser.page import LEFT_WIDTH
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.core.rows import FrequencyRows
@@ -60,7 +60,7 @@ FLAGS = (
     "--use-angle=swiftshader",
     "--window-size=1440,560",
 )
-CONFIG = package_data() / "config" / "skin_demo.yaml"
+CONFIG = find_package_data() / "config" / "skin_demo.yaml"
 SKIN = read_skin(CONFIG)
 N = len(SKIN.cubes)
 PRESSED, RATE, NOISE = 10, 50.0, 8e-6

@@ -315,12 +315,12 @@ def test_what_foxglove_plots_are_fields_of_our_messages():
 def live_table(width: int) -> tuple[str, list[str]]:
     """The table of sixteen planar cubes as a terminal of this width shows it, and their rows."""
     console = pytest.importorskip("rich.console", reason="needs rich: run this with ./cube test")
-    from cube_tensor_driver.config.package_data import package_data
+    from cube_tensor_driver.config.package_data import find_package_data
     from cube_tensor_driver.config.skin import read_skin
     from cube_tensor_driver.core.rows import StressRows
     from cube_tensor_driver.views.terminal.live_table import LiveTable
 
-    skin = read_skin(package_data() / "config" / "skin_demo.yaml")
+    skin = read_skin(find_package_data() / "config" / "skin_demo.yaml")
     n = len(skin.cubes)
     stress, gradient = np.full((n, 6), np.nan, np.float32), np.full((n, 9), np.nan, np.float32)
     stress[:, [0, 2, 4]], gradient[:, [6, 8]] = -123e3, -12e6

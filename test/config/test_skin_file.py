@@ -16,7 +16,7 @@ import yaml
 from cube_tensor_driver.calibrate.load_table import read_loads
 from cube_tensor_driver.config.calibration import read_calibration
 from cube_tensor_driver.config.grid import describe_grid
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import Elastomer, check_skin, read_skin
 from cube_tensor_driver.config.yaml import parse_yaml, write_yaml
 from cube_tensor_driver.core.errors import ConfigError, FitError
@@ -33,13 +33,13 @@ def read(tmp_path: Path, data: object):
 
 @pytest.mark.parametrize("name", ["skin_demo.yaml", "cube.yaml"])
 def test_shipped_skins(name):
-    skin = read_skin(package_data() / "config" / name)
+    skin = read_skin(find_package_data() / "config" / name)
     assert len(skin.cubes) == {"skin_demo.yaml": 16, "cube.yaml": 1}[name]
     assert skin.n_pads == 8
 
 
 def test_shipped_calibrations_have_their_id():
-    paths = sorted((package_data() / "config" / "calibration").glob("*.yaml"))
+    paths = sorted((find_package_data() / "config" / "calibration").glob("*.yaml"))
     assert paths
     for path in paths:
         assert read_calibration(path).id in path.read_text()
@@ -181,7 +181,7 @@ def test_one_message_per_mistake(tmp_path, break_it, words):
 
 
 def test_a_skin_shows_itself_in_one_line():
-    shown = repr(read_skin(package_data() / "config" / "skin_demo.yaml"))
+    shown = repr(read_skin(find_package_data() / "config" / "skin_demo.yaml"))
     assert shown == "<Skin 'skin': 16 cubes (planar) on 2 links, 100 Hz>"
 
 
@@ -288,7 +288,7 @@ def test_only_regular_files_are_read_and_only_up_to_their_limit(tmp_path, monkey
     """A device has no end and a pipe waits for ever: neither is read at all."""
     os.mkfifo(tmp_path / "pipe")
     monkeypatch.setattr("cube_tensor_driver.config.input_files.MAX_BYTES", 1000)
-    layout = read_skin(package_data() / "config" / "cube.yaml").calibrations[0].layout
+    layout = read_skin(find_package_data() / "config" / "cube.yaml").calibrations[0].layout
     for read_one in (read_skin, lambda at: read_loads(at, layout)):
         with pytest.raises((ConfigError, FitError)) as caught:
             read_one(tmp_path / path)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from conftest import check, stamped
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core import status
 from cube_tensor_driver.core.calibration import illustrative
@@ -118,7 +118,7 @@ def test_a_load_that_moves_fast_is_no_noise(frequency):
 def test_a_load_that_moves_while_hubs_stall_is_no_noise():
     """Up to 60 ms of rows at 500 Hz, then up to 0.2 s of none, as on a machine with too much to do;
     the demo's load at four times its speed."""
-    skin = read_skin(package_data() / "config" / "skin_demo.yaml")
+    skin = read_skin(find_package_data() / "config" / "skin_demo.yaml")
     load, cubes = (
         Load(skin, default_script()),
         SimulatedCubes([cube.calibration for cube in skin.cubes]),
@@ -398,7 +398,9 @@ def test_a_line_says_when_a_cube_breaks_and_when_it_is_fine_again():
     from cube_tensor_driver.ros.diagnostics.reconstruction import CubeHealth
 
     skin = Skin(16)
-    words = CubeHealth(read_skin(package_data() / "config" / "skin_demo.yaml"), skin.reconstructor)
+    words = CubeHealth(
+        read_skin(find_package_data() / "config" / "skin_demo.yaml"), skin.reconstructor
+    )
     said, statuses, summaries = [], [], []
     for harm in (
         lambda frequency, row: None,
@@ -425,7 +427,9 @@ def test_a_cube_with_a_residual_is_a_warning_and_counted():
     from cube_tensor_driver.ros.diagnostics.reconstruction import CubeHealth
 
     skin = Skin(16)
-    words = CubeHealth(read_skin(package_data() / "config" / "skin_demo.yaml"), skin.reconstructor)
+    words = CubeHealth(
+        read_skin(find_package_data() / "config" / "skin_demo.yaml"), skin.reconstructor
+    )
     skin.play(2)
     words.statuses({})
     skin.play(3, lambda frequency, row: frequency[2].__setitem__(5, 1.01 * frequency[2, 5]))
@@ -440,7 +444,7 @@ def test_a_start_is_quiet_and_a_cube_that_stays_away_is_not():
     pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
     from cube_tensor_driver.ros.diagnostics.reconstruction import MIN_UPDATES_TO_LOG, CubeHealth
 
-    skin = read_skin(package_data() / "config" / "skin_demo.yaml")
+    skin = read_skin(find_package_data() / "config" / "skin_demo.yaml")
     n = len(skin.cubes)
     reconstructor = Reconstructor(skin)
     words = CubeHealth(skin, reconstructor)

@@ -29,7 +29,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import PointCloud2
 
 from conftest import ROOT, decoded
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.core.forces import Forces
@@ -44,11 +44,11 @@ from cube_tensor_driver.msg import (
     StressTensorStamped,
 )
 from cube_tensor_driver.processes.children import Children, format_ros_arguments
-from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
+from cube_tensor_driver.processes.skin_processes import SimulatedHubs, list_skin_processes
 from cube_tensor_driver.ros.messages import to_ns
 from cube_tensor_driver.views.terminal.live_table import LiveTable
 
-SKIN = package_data() / "config" / "skin_demo.yaml"
+SKIN = find_package_data() / "config" / "skin_demo.yaml"
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -188,7 +188,7 @@ def test_every_topic_of_a_skin(ros, tmp_path):
     touches = ros.listen(SkinTouch, "touch")
     diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
     with Children(tmp_path) as children:
-        for process in skin_processes(SKIN, simulated=SimulatedHubs(tmp_path / "ports")):
+        for process in list_skin_processes(SKIN, simulated=SimulatedHubs(tmp_path / "ports")):
             if process.node:
                 process.parameters["publish_period"] = scans / skin.rate
             if process.executable == "reconstruction":
@@ -289,7 +289,9 @@ def test_one_process_sends_frequencies_to_who_listens(ros, tmp_path):
 
     with Children(tmp_path) as children:
         children.start(
-            skin_processes(SINGLE, composed=True, simulated=SimulatedHubs(tmp_path / "ports"))[1]
+            list_skin_processes(SINGLE, composed=True, simulated=SimulatedHubs(tmp_path / "ports"))[
+                1
+            ]
         )
         ros.wait(lambda: 1 in hub.listen())
         hub.send(greeting())

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from conftest import ROOT
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.tensor import rotation_from_rpy
 
-FOLDER = package_data() / "config" / "examples"
+FOLDER = find_package_data() / "config" / "examples"
 
 
 def test_forearm_is_a_cylinder_of_mixed_cubes_that_look_outwards():

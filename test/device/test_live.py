@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import Skin, SkinCube, SkinLink, read_skin
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.rows import FrequencyRows
@@ -92,7 +92,7 @@ class RandomHub:
 
 def make_skin(*cubes_of_links: int) -> Skin:
     """Links of so many cubes each, by link and index."""
-    calibration = read_skin(package_data() / "config" / "cube.yaml").cubes[0].calibration
+    calibration = read_skin(find_package_data() / "config" / "cube.yaml").cubes[0].calibration
     assert calibration.layout.n_pads == N_PADS
     links = tuple(
         SkinLink(f"hub{number}", "/dev/none", 115200, None) for number in range(len(cubes_of_links))

@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 
 from conftest import ROOT, decoded, end
 from cube_tensor_driver.cli.main import main
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import Skin, read_skin
 from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.rows import concatenate
@@ -32,7 +32,7 @@ from cube_tensor_driver.core.status import STAMP
 from cube_tensor_driver.device.wire.decoder import Decoder
 from cube_tensor_driver.device.wire.protocol import Command, Request, Sample, Time, encode
 from cube_tensor_driver.processes.children import Children
-from cube_tensor_driver.processes.skin_processes import skin_processes
+from cube_tensor_driver.processes.skin_processes import list_skin_processes
 from cube_tensor_driver.simulation.cubes import compute_skin_components, make_hub_cubes
 from cube_tensor_driver.simulation.load import Load, default_script
 from cube_tensor_hub.captures import COUNTER_HZ, WINDOW_US, Oscillators, find_edges
@@ -43,7 +43,7 @@ from cube_tensor_hub.rule import Outcome
 from cube_tensor_hub.transcript import FrameListener
 
 SOURCE = ROOT / "firmware"
-SKIN = package_data() / "config" / "skin_firmware.yaml"
+SKIN = find_package_data() / "config" / "skin_firmware.yaml"
 OF_PERIODS = {"H1", "R3", "R6", "R7"}
 NO_CC, NO_ARM = (
     find_missing("make", "cc"),
@@ -284,7 +284,7 @@ def test_the_load_on_the_pads_comes_out_as_tensors(out, ros, tmp_path):
     skin = read_skin(SKIN)
     messages = ros.listen(SkinStress, "stress")
     with emulated_hub(out / "hub.elf", skin) as (port, pads), Children(tmp_path) as children:
-        for process in skin_processes(SKIN, port=port, composed=True):
+        for process in list_skin_processes(SKIN, port=port, composed=True):
             children.start(process)
         ros.wait(lambda: len(messages) > 100)
         children.check()

@@ -24,7 +24,7 @@ from cube_tensor_driver.bags.read import Bag
 from cube_tensor_driver.bags.reprocess.job import ReprocessJob, make_table, reprocess
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.cli.main import main
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.modes import COMPONENTS
 from cube_tensor_driver.core.rows import StressRows
@@ -32,7 +32,7 @@ from cube_tensor_driver.lerobot.statistics import describe, summarise
 from cube_tensor_driver.lerobot.windows import TACTILE, stream_windows
 from cube_tensor_driver.messages.types import INFO
 
-SKIN = package_data() / "config" / "skin_demo.yaml"
+SKIN = find_package_data() / "config" / "skin_demo.yaml"
 FPS = 30
 JOINTS, RAW, JPEG, MARKS = "/joint_states", "/camera/image_raw", "/camera/image/compressed", "/mark"
 SIZE = (6, 8)

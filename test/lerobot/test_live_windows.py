@@ -24,7 +24,7 @@ import cube_tensor_driver as ctd
 from conftest import ROOT
 from cube_tensor_driver.bags.tables import as_array
 from cube_tensor_driver.cli.main import main
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import Skin, read_skin
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows, concatenate
 from cube_tensor_driver.lerobot import live as live_module
@@ -84,7 +84,7 @@ class HeldSource:
 
 def test_windows_hold_the_bits_of_the_stress_and_a_pause_lengthens_one(tmp_path):
     """Frames of 1, 2, 60 (a pause) and 3 scans, against one reconstruction of all rows."""
-    skin = read_skin(package_data() / "config" / "skin_demo.yaml")
+    skin = read_skin(find_package_data() / "config" / "skin_demo.yaml")
     cubes = len(skin.cubes)
     with ctd.simulate(skin, duration=0.3, rate=RATE) as simulated:
         rows = concatenate(list(simulated))
@@ -122,7 +122,7 @@ def test_windows_hold_the_bits_of_the_stress_and_a_pause_lengthens_one(tmp_path)
 
 def test_live_windows_have_the_bits_of_the_export_of_the_same_run(tmp_path):
     """The samples of all frames, one after the other; both divide them into other frames."""
-    path = package_data() / "config" / "skin_demo.yaml"
+    path = find_package_data() / "config" / "skin_demo.yaml"
     bag = make_bag(tmp_path / "bag", path, 60)
     with ctd.open_bag(bag) as recorded:
         rows = concatenate(list(recorded))
@@ -153,7 +153,7 @@ def test_live_windows_have_the_bits_of_the_export_of_the_same_run(tmp_path):
 def test_a_frame_has_what_arrived_while_the_recorder_computed(tmp_path, monkeypatch):
     """No other thread runs between the arrival of a scan and the reading of the frame."""
     monkeypatch.setattr(live_module, "CATCH_UP_S", 0.3)
-    skin = read_skin(package_data() / "config" / "skin_demo.yaml")
+    skin = read_skin(find_package_data() / "config" / "skin_demo.yaml")
     cubes = len(skin.cubes)
     with ctd.simulate(skin, duration=0.02, rate=RATE) as simulated:
         rows = concatenate(list(simulated))
@@ -186,7 +186,7 @@ def test_a_frame_waits_for_samples_that_are_older_than_5_ms_only(tmp_path, monke
     """The newest sample is 50 ms old, so the one that arrives 0.1 s later is waited for; a sample
     of now is not waited for."""
     monkeypatch.setattr(live_module, "CATCH_UP_S", 10.0)
-    skin = read_skin(package_data() / "config" / "skin_demo.yaml")
+    skin = read_skin(find_package_data() / "config" / "skin_demo.yaml")
     cubes = len(skin.cubes)
     source = HeldSource(skin)
     live = LiveWindows(source, tmp_path / "touch", **SIZE)
@@ -224,7 +224,7 @@ def assert_picture_shows(picture: np.ndarray, last: StressRows) -> None:
     "wrong", [{"width": 191}, {"height": 31}, {"full_scale": 0.0}, {"full_scale": float("nan")}]
 )
 def test_impossible_pictures_are_refused(tmp_path, wrong):
-    source = HeldSource(read_skin(package_data() / "config" / "skin_demo.yaml"))
+    source = HeldSource(read_skin(find_package_data() / "config" / "skin_demo.yaml"))
     with pytest.raises(ctd.CubeError, match=str(next(iter(wrong.values())))):
         LiveWindows(source, tmp_path, **(SIZE | wrong))
     with pytest.raises(ctd.CubeError, match="no recordings"):

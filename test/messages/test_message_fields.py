@@ -17,7 +17,7 @@ from cube_tensor_driver.bags.read import Bag, make_message
 from cube_tensor_driver.bags.reprocess.job import Overrides, ReprocessJob, reprocess
 from cube_tensor_driver.browser.markup import format_newtons
 from cube_tensor_driver.config.calibration import find_shipped_calibration
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import Elastomer, Skin, SkinCube, SkinLink, read_skin
 from cube_tensor_driver.config.yaml import parse_yaml
 from cube_tensor_driver.core.calibration import Calibration
@@ -38,7 +38,7 @@ from cube_tensor_driver.touch.tracker.contact_tracker import TrackedContact
 
 PLANAR, CUBE = (find_shipped_calibration(LAYOUTS[name]) for name in ("planar", "cube"))
 DRAWS = 40_000
-SKIN_FILE = package_data() / "config" / "skin_demo.yaml"
+SKIN_FILE = find_package_data() / "config" / "skin_demo.yaml"
 
 
 def noise_covariance(calibration: Calibration) -> np.ndarray:

@@ -32,7 +32,7 @@ from cube_tensor_driver.config.yaml import parse_yaml, write_yaml
 from cube_tensor_driver.core.modes import GRADIENT, STRESS
 from cube_tensor_driver.device.wire.protocol import Command
 from cube_tensor_driver.processes.children import Children
-from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
+from cube_tensor_driver.processes.skin_processes import SimulatedHubs, list_skin_processes
 from cube_tensor_driver.ros.commands.echo import StressReading
 
 pytestmark = pytest.mark.xdist_group("ros commands")
@@ -59,7 +59,7 @@ def skin(tmp_path_factory):
     hubs = SimulatedHubs(folder / "ports", load=folder / "load.yaml")
     with free_domain(), pytest.MonkeyPatch.context() as patch, Children(folder) as children:
         patch.setenv("ROS_HOME", str(folder))
-        for process in skin_processes(folder / "skin.yaml", composed=True, simulated=hubs):
+        for process in list_skin_processes(folder / "skin.yaml", composed=True, simulated=hubs):
             children.start(process)
         children.wait_for_line("composed", "with 2 cubes", 30.0)
         yield folder / "ports"

@@ -26,7 +26,7 @@ from cube_tensor_driver.bags.source import open_bag
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.cli.main import main
 from cube_tensor_driver.config.influence import find_influence
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import Elastomer, Skin, read_skin
 from cube_tensor_driver.core.defaults import FREQUENCY_NOISE
 from cube_tensor_driver.core.errors import ConfigError
@@ -129,7 +129,7 @@ def test_pads_in_a_thin_layer_out_of_a_bag(tmp_path, one_process):
     from cube_tensor_driver.msg import SkinContacts
     from cube_tensor_driver.ros.messages import make_info_message
 
-    skin = read_skin(package_data() / "config" / "skin_demo.yaml")
+    skin = read_skin(find_package_data() / "config" / "skin_demo.yaml")
     influence = read_influence(find_influence("cube_11mm"))
     calibration, centre = skin.calibrations[0], np.array([1e-3, -2e-3])
     sources, forces = contact.hertz(3e-3, FORCE, centre, order=8)
@@ -200,7 +200,9 @@ def test_contacts_and_traction_of_a_pressed_skin_live_and_out_of_a_bag(ros, tmp_
     from cube_tensor_driver.processes.skin_processes import Process
     from cube_tensor_driver.ros.messages import make_info_message
 
-    skin = replace(read_skin(package_data() / "config" / "skin_demo.yaml"), elastomer=ELASTOMER)
+    skin = replace(
+        read_skin(find_package_data() / "config" / "skin_demo.yaml"), elastomer=ELASTOMER
+    )
     middle = np.array([cube.xyz for cube in skin.cubes])[:, :2].mean(axis=0)
     described = make_info_message(skin, Pipeline(skin.calibrations), time.time_ns())
     described.sender = "reconstruction"

@@ -28,7 +28,7 @@ from cube_tensor_driver.bags.read import Bag
 from cube_tensor_driver.bags.summary import last_diagnostics
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.browser import markup
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
@@ -37,7 +37,7 @@ from cube_tensor_driver.device.chain import LinkReport
 from cube_tensor_driver.device.links.link import LinkState
 from cube_tensor_driver.device.scans.row_counts import RowCounts
 from cube_tensor_driver.processes.children import Children
-from cube_tensor_driver.processes.skin_processes import RECORDED, skin_processes
+from cube_tensor_driver.processes.skin_processes import RECORDED, list_skin_processes
 from cube_tensor_driver.ros.callbacks import CallbackErrors
 from cube_tensor_driver.ros.commands import record
 from cube_tensor_driver.ros.commands.echo import resolve_topics
@@ -51,7 +51,7 @@ from cube_tensor_driver.ros.diagnostics.updater import Diagnostics
 from cube_tensor_driver.ros.nodes.driver import Driver
 
 DEPTH = 10
-SKIN = read_skin(package_data() / "config" / "skin_demo.yaml")
+SKIN = read_skin(find_package_data() / "config" / "skin_demo.yaml")
 
 
 def pairs(status: DiagnosticStatus) -> dict[str, str]:
@@ -284,7 +284,7 @@ def test_a_recording_of_a_namespace_has_no_diagnostics_of_another(ros, tmp_path,
     recorder_node = rclpy.create_node("recorder", namespace="left")
     names = resolve_topics(recorder_node, RECORDED)
     recorder_node.destroy_node()
-    (driver,) = skin_processes(SINGLE)[1:]
+    (driver,) = list_skin_processes(SINGLE)[1:]
     parameters = driver.parameters | {"rate": 250}
     with (
         Children(tmp_path) as children,

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from rclpy.serialization import serialize_message
 
 from cube_tensor_driver.config.calibration import read_calibration
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.device.wire.decoder import MAX_RUN, Decoder
@@ -31,8 +31,8 @@ from workshop.bench.decode import INTACT_COBS, LATE_FAILURE, READ, make_clean_fr
 
 EACH = 2_000_000
 SHIPPED = {
-    read_calibration: package_data() / "config" / "calibration" / "cube.yaml",
-    read_skin: package_data() / "config" / "skin_demo.yaml",
+    read_calibration: find_package_data() / "config" / "calibration" / "cube.yaml",
+    read_skin: find_package_data() / "config" / "skin_demo.yaml",
 }
 
 

@@ -23,10 +23,10 @@ from pathlib import Path
 import pytest
 
 from conftest import ROOT
-from cube_tensor_driver.config.package_data import package_data
-from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
+from cube_tensor_driver.config.package_data import find_package_data
+from cube_tensor_driver.processes.skin_processes import SimulatedHubs, list_skin_processes
 
-SKIN = package_data() / "config" / "skin_demo.yaml"
+SKIN = find_package_data() / "config" / "skin_demo.yaml"
 
 # A sourced ROS 2 has these; the wheels do not.
 needs_launch = pytest.mark.skipif(
@@ -42,13 +42,18 @@ needs_ros2 = pytest.mark.skipif(
 def test_the_demo_starts_what_it_needs_in_order():
     names = [
         process.executable
-        for process in skin_processes(
+        for process in list_skin_processes(
             SKIN, simulated=SimulatedHubs(Path("p")), markers=True, contacts=True
         )
     ]
     assert names == ["simulator", "reconstruction", "driver", "markers", "contacts"]
-    assert [process.executable for process in skin_processes(SKIN, composed=True)] == ["composed"]
-    assert [process.executable for process in skin_processes(SKIN)] == ["reconstruction", "driver"]
+    assert [process.executable for process in list_skin_processes(SKIN, composed=True)] == [
+        "composed"
+    ]
+    assert [process.executable for process in list_skin_processes(SKIN)] == [
+        "reconstruction",
+        "driver",
+    ]
 
 
 def test_every_executable_of_the_list_is_installed_and_runs_its_module(monkeypatch):
@@ -58,8 +63,8 @@ def test_every_executable_of_the_list_is_installed_and_runs_its_module(monkeypat
     monkeypatch.setattr(signal, "signal", lambda *_: None)  # scripts set up their own Ctrl-C
     started: list[str] = []
     every = [
-        *skin_processes(SKIN, simulated=SimulatedHubs(Path("p")), markers=True, contacts=True),
-        *skin_processes(SKIN, composed=True),
+        *list_skin_processes(SKIN, simulated=SimulatedHubs(Path("p")), markers=True, contacts=True),
+        *list_skin_processes(SKIN, composed=True),
     ]
     for process in every:
         module, name = importlib.import_module(process.module), process.executable
@@ -137,7 +142,7 @@ def test_every_node_runs_with_what_package_xml_installs(ros, robot, tmp_path):
     from cube_tensor_driver.processes.children import Children
 
     simulated = SimulatedHubs(tmp_path / "ports")
-    every = skin_processes(SKIN, simulated=simulated, markers=True, contacts=True)
+    every = list_skin_processes(SKIN, simulated=simulated, markers=True, contacts=True)
     heard = [
         ros.listen(SkinContacts, "contacts"),
         ros.listen(PointCloud2, "traction"),

@@ -141,7 +141,7 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     from rclpy.qos import DurabilityPolicy, QoSProfile
     from visualization_msgs.msg import Marker, MarkerArray
 
-    from cube_tensor_driver.config.package_data import package_data
+    from cube_tensor_driver.config.package_data import find_package_data
     from cube_tensor_driver.config.skin import read_skin
     from cube_tensor_driver.core.pipeline import Pipeline
     from cube_tensor_driver.msg import SkinContacts, SkinInfo, SkinStress
@@ -149,7 +149,7 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     from cube_tensor_driver.processes.skin_processes import Process
     from cube_tensor_driver.ros.messages import make_info_message
 
-    skin = read_skin(package_data() / "config" / "skin_demo.yaml")
+    skin = read_skin(find_package_data() / "config" / "skin_demo.yaml")
     n, pressed, silent = len(skin.cubes), 6, 15
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     info = ros.node.create_publisher(SkinInfo, "info", latched)

@@ -41,7 +41,7 @@ from cube_tensor_driver.messages.types import COMPENSATION as COMPENSATION_TYPE
 from cube_tensor_driver.messages.types import FREQUENCIES, INFO, STRESS
 from cube_tensor_driver.msg import SkinCompensation, SkinStress
 from cube_tensor_driver.processes.children import Children
-from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
+from cube_tensor_driver.processes.skin_processes import SimulatedHubs, list_skin_processes
 from cube_tensor_driver.ros.messages import to_ns, to_time
 from cube_tensor_driver.ros.motion import _decode
 from cube_tensor_driver.ros.nodes.contacts import Contacts
@@ -517,7 +517,7 @@ def test_the_weight_of_a_simulated_arm_that_moves_is_subtracted(ros, tmp_path, s
     )
     batches = ros.listen(SkinStress, "stress")
     with Children(tmp_path) as children:
-        for process in skin_processes(skin_file, simulated=hubs):
+        for process in list_skin_processes(skin_file, simulated=hubs):
             children.start(process)
         ros.wait(lambda: batches and batches[-1].status[0] & WEIGHT)
         del batches[:]

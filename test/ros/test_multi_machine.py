@@ -25,13 +25,13 @@ import pytest
 pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 
 from cube_tensor_driver.bags.read import Bag
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.messages.types import STRESS
 from cube_tensor_driver.processes.children import format_ros_arguments
-from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
+from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, list_skin_processes
 from cube_tensor_driver.simulation.sample_log import SampleLog
 
-SKIN = package_data() / "config" / "skin_demo.yaml"
+SKIN = find_package_data() / "config" / "skin_demo.yaml"
 CUBES, RATE = 16, 100
 QUEUE_S = 2.0
 """What queues hold: ros/node.py."""
@@ -185,7 +185,7 @@ def sampled(log: SampleLog) -> dict[tuple[int, int], int]:
 
 def test_a_cut_cable_costs_what_queues_do_not_hold_and_that_is_counted(hosts, tmp_path):
     bag, log = tmp_path / "bag", tmp_path / "log.json"
-    for process in skin_processes(
+    for process in list_skin_processes(
         SKIN, simulated=SimulatedHubs(tmp_path / "ports", sample_log=log, instants=16)
     ):
         hosts.start("desk" if process.executable == "reconstruction" else "robot", process)

@@ -22,7 +22,7 @@ from conftest import free_domain, observer_node
 from cube_tensor_driver.device.wire.protocol import Command
 from cube_tensor_driver.msg import SkinFrequencies, SkinStress
 from cube_tensor_driver.processes.children import Children
-from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
+from cube_tensor_driver.processes.skin_processes import SimulatedHubs, list_skin_processes
 
 
 class Nodes:
@@ -35,7 +35,7 @@ class Nodes:
         self.stress = ros.listen(SkinStress, "stress")
         self.diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
         self.hub = None
-        for process in skin_processes(SINGLE, simulated=SimulatedHubs(self._ports))[1:]:
+        for process in list_skin_processes(SINGLE, simulated=SimulatedHubs(self._ports))[1:]:
             children.start(process)
         self.wait(
             lambda: (

@@ -20,7 +20,7 @@ from cube_tensor_driver.config.grid import describe_grid
 from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.msg import SkinFrequencies, SkinStress
 from cube_tensor_driver.processes.children import Children
-from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
+from cube_tensor_driver.processes.skin_processes import SimulatedHubs, list_skin_processes
 
 
 def test_nodes_run_where_rclpy_lacks_what_humble_lacks(ros, tmp_path, monkeypatch):
@@ -33,7 +33,7 @@ def test_nodes_run_where_rclpy_lacks_what_humble_lacks(ros, tmp_path, monkeypatc
     frequencies = ros.listen(SkinFrequencies, "frequencies")
     hubs = SimulatedHubs(tmp_path / "ports")
     with Children(tmp_path) as children:
-        for process in skin_processes(skin, composed=True, simulated=hubs):
+        for process in list_skin_processes(skin, composed=True, simulated=hubs):
             if process.node:
                 arguments = ",".join(FEATURES), process.module
                 process = replace(process, module="rclpy_without", arguments=arguments)

@@ -21,11 +21,11 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from conftest import encoded, free_domain, observer_node
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 from cube_tensor_driver.processes.children import Children
-from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
+from cube_tensor_driver.processes.skin_processes import SimulatedHubs, list_skin_processes
 from cube_tensor_driver.srv import Tare
 
 ACTIVE = 3
@@ -40,9 +40,9 @@ def running(tmp_path_factory):
         observer_node(domain) as ros,
         Children(folder) as children,
     ):
-        config = package_data() / "config" / "cube.yaml"
+        config = find_package_data() / "config" / "cube.yaml"
         hubs = SimulatedHubs(folder / "ports")
-        for process in skin_processes(config, simulated=hubs, markers=True, contacts=True):
+        for process in list_skin_processes(config, simulated=hubs, markers=True, contacts=True):
             children.start(process)
         yield ros, ros.listen(SkinStress, "stress"), children
 

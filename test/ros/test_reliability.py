@@ -33,14 +33,14 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import Trigger
 
 from conftest import ROOT, decoded
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.tare import write_tare
 from cube_tensor_driver.config.yaml import read_yaml, write_yaml
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 from cube_tensor_driver.processes.children import Children, format_ros_arguments
-from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
+from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, list_skin_processes
 from cube_tensor_driver.srv import Tare
 
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -64,7 +64,9 @@ class PlayedSkin:
     def start(self):
         self.hub.listen()
         self.hub.requests.clear()
-        for process in skin_processes(SINGLE, simulated=SimulatedHubs(self.folder / "ports"))[1:]:
+        for process in list_skin_processes(SINGLE, simulated=SimulatedHubs(self.folder / "ports"))[
+            1:
+        ]:
             if process.executable == "reconstruction":
                 process.parameters["tare_folder"] = str(self.folder / "tare")
             self.children.start(process)
@@ -164,7 +166,7 @@ def test_tare_is_refused_taken_told_kept_and_undone(stage):
 
 
 def test_a_tared_skin_with_uids_starts_again(ros, tmp_path):
-    data = read_yaml(package_data() / "config" / "cube.yaml")
+    data = read_yaml(find_package_data() / "config" / "cube.yaml")
     for number, cube in enumerate(data["cubes"]):
         cube["uid"] = 0xABC0 + number
         cube.pop("index", None)
@@ -175,7 +177,7 @@ def test_a_tared_skin_with_uids_starts_again(ros, tmp_path):
     created = datetime.now(timezone.utc)
     write_tare(tmp_path / "tare", cube.uid, cube.calibration, kept, created)
     with Children(tmp_path) as children:
-        processes = skin_processes(config, simulated=SimulatedHubs(tmp_path / "ports"))
+        processes = list_skin_processes(config, simulated=SimulatedHubs(tmp_path / "ports"))
         for process in processes:
             if process.executable == "reconstruction":
                 process.parameters["tare_folder"] = str(tmp_path / "tare")
@@ -281,7 +283,7 @@ def schema_errors(
 
 def test_the_security_policy_keeps_the_schema_of_sros2():
     schema = ElementTree.parse(ROOT / "test" / "data" / "sros2_policy.xsd").getroot()
-    path = package_data() / "config" / "security" / "policy.xml"
+    path = find_package_data() / "config" / "security" / "policy.xml"
     policy = ElementTree.parse(path).getroot()
     assert schema_errors(policy, "Policy", schema) == []
     # What the schema cannot say: each node once, and names that ROS allows.
@@ -326,7 +328,9 @@ def test_the_security_policy_allows_what_the_nodes_do(stage, tmp_path):
     stage.start()
     node = stage.ros.node
     profiles = list(
-        ElementTree.parse(package_data() / "config" / "security" / "policy.xml").iter("profile")
+        ElementTree.parse(find_package_data() / "config" / "security" / "policy.xml").iter(
+            "profile"
+        )
     )
     found = {
         "publish": node.get_publisher_names_and_types_by_node,
@@ -375,7 +379,7 @@ def test_the_security_policy_allows_what_the_nodes_do(stage, tmp_path):
 @pytest.mark.parametrize("executable", ["driver", "reconstruction"])
 def test_a_hundred_lifecycle_cycles_leak_nothing(ros, tmp_path, executable):
     """Beside the other node, which goes on: what comes in meanwhile must not leak either."""
-    processes = skin_processes(SINGLE, simulated=SimulatedHubs(tmp_path / "ports"))
+    processes = list_skin_processes(SINGLE, simulated=SimulatedHubs(tmp_path / "ports"))
     next(process for process in processes if process.executable == executable).parameters[
         "autostart"
     ] = False
@@ -392,7 +396,7 @@ def test_a_hundred_lifecycle_cycles_leak_nothing(ros, tmp_path, executable):
         client = ros.node.create_client(ChangeState, f"/{executable}/change_state")
         ros.wait(client.service_is_ready)
         ros.call(GetState, f"/{executable}/get_state", GetState.Request())  # they have met
-        process = psutil.Process(children.pid(executable))
+        process = psutil.Process(children.find_pid(executable))
 
         def run(cycles):
             for _ in range(cycles):
@@ -416,12 +420,12 @@ def test_a_hundred_lifecycle_cycles_leak_nothing(ros, tmp_path, executable):
 
 
 def test_lifecycle_in_the_middle_of_a_reconnect(ros, tmp_path, deaf):
-    _, _, driver = skin_processes(SINGLE, simulated=SimulatedHubs(tmp_path))
+    _, _, driver = list_skin_processes(SINGLE, simulated=SimulatedHubs(tmp_path))
     driver.parameters.update(autostart=False, port_directory="", port=deaf)
     kind = Transition
     with Children(tmp_path) as children:
         children.start(driver)
-        process = psutil.Process(children.pid("driver"))
+        process = psutil.Process(children.find_pid("driver"))
 
         def change(number):
             begun = time.monotonic()

@@ -27,7 +27,7 @@ from cube_tensor_driver.core.rows import StressRows
 from cube_tensor_driver.core.status import INVALID, PAD_FAULT
 from cube_tensor_driver.core.tensor import rotation_from_rpy
 from cube_tensor_driver.processes.children import Children
-from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
+from cube_tensor_driver.processes.skin_processes import SimulatedHubs, list_skin_processes
 from cube_tensor_driver.ros.nodes.state_interfaces import (
     COMPONENTS,
     SkinWrenches,
@@ -119,8 +119,8 @@ def test_an_unknown_wrench_is_nan(skin_file):
 
 def test_what_the_parameter_cannot_be_is_one_line(skin_file, monkeypatch):
     parameter = next(one for one in RECONSTRUCTION if one.name == "hardware_name")
-    assert parameter.refusal("Skin/Left_2") == parameter.refusal("") == ""
-    assert "letters, digits, _ and /" in parameter.refusal("2 skins")
+    assert parameter.find_refusal("Skin/Left_2") == parameter.find_refusal("") == ""
+    assert "letters, digits, _ and /" in parameter.find_refusal("2 skins")
     values = {"hardware_name": "skin", "wrench_side": 0.0, "publish_period": 0.0}
     node = SimpleNamespace(value=values.get)
     monkeypatch.setitem(sys.modules, "pal_statistics_msgs.msg", None)
@@ -240,7 +240,7 @@ def test_a_hardware_component_gets_wrenches_until_they_are_unknown(ros, tmp_path
     )
     skin = read_skin(skin_file)
     with Children(tmp_path) as children:
-        for process in skin_processes(skin_file, simulated=SimulatedHubs(tmp_path / "ports")):
+        for process in list_skin_processes(skin_file, simulated=SimulatedHubs(tmp_path / "ports")):
             if process.executable == "reconstruction":
                 process.parameters["hardware_name"] = "Skin/Hand"
             children.start(process)

@@ -16,7 +16,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 
 from std_srvs.srv import Trigger
 
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.tare import read_tare, write_tare
 from cube_tensor_driver.core.reconstructor import Reconstructor
@@ -28,7 +28,7 @@ from cube_tensor_driver.ros.nodes.taring import Taring
 from cube_tensor_driver.srv import Tare
 
 UID = 0xABC0
-SKIN = read_skin(package_data() / "config" / "cube.yaml")
+SKIN = read_skin(find_package_data() / "config" / "cube.yaml")
 CALIBRATION = SKIN.cubes[0].calibration
 KEPT = 1.001 * CALIBRATION.rest_frequency
 RATE = 500

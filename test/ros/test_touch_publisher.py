@@ -15,7 +15,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
 
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import Elastomer, Skin, read_skin
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import StressRows, concatenate
@@ -25,7 +25,7 @@ from cube_tensor_driver.ros.messages import to_ns
 from cube_tensor_driver.ros.nodes.touch_publisher import TouchPublisher
 from cube_tensor_driver.touch.touch_detection import Touches
 
-SKIN = read_skin(package_data() / "config" / "skin_demo.yaml")
+SKIN = read_skin(find_package_data() / "config" / "skin_demo.yaml")
 START_NS = 1_700_000_000_123_456_789
 
 

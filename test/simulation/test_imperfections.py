@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.simulation.imperfections import (
@@ -72,7 +72,7 @@ def test_gains_spread_and_pads_fail_as_often_as_asked_for_and_always_alike():
 
 def test_a_simulated_skin_has_them():
     """Dead pads are NaN; creep shows after the load has lasted, and nothing else changes."""
-    skin = read_skin(package_data() / "config" / "skin_demo.yaml")
+    skin = read_skin(find_package_data() / "config" / "skin_demo.yaml")
     dead = next(iter(simulate(skin, imperfections=Imperfections(dead=0.5))))
     assert 0.2 < np.isnan(dead.frequency).mean() < 0.8
     sound, same, creeping = (

@@ -14,7 +14,7 @@ import yaml
 from scipy import interpolate
 
 from cube_tensor_driver.config.load_script import Script, interpolate_knots, read_script
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import Skin, SkinCube, read_skin
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.tensor import rotation_from_rpy
@@ -22,7 +22,7 @@ from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.simulation.load import Load, default_script
 from cube_tensor_driver.simulation.spline import CubicSpline
 
-ONE = read_skin(package_data() / "config" / "cube.yaml").cubes[0]
+ONE = read_skin(find_package_data() / "config" / "cube.yaml").cubes[0]
 H = 0.004
 
 
@@ -229,7 +229,7 @@ def test_a_cube_that_faces_away_sees_nothing(tmp_path):
 
 
 def test_the_shipped_script_is_the_same_in_every_process_and_never_lets_go():
-    skin = read_skin(package_data() / "config" / "skin_demo.yaml")
+    skin = read_skin(find_package_data() / "config" / "skin_demo.yaml")
     one, two = Load(skin, default_script()), Load(skin, default_script())
     assert one.period == 8.0
     for time in np.arange(0, 8, 0.37):

@@ -15,7 +15,7 @@ import pytest
 from conftest import ROOT
 from cube_tensor_driver.cli.main import main
 from cube_tensor_driver.config.grid import describe_grid
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import Skin, check_skin_data, read_skin
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.mechanics import contact
@@ -28,7 +28,7 @@ from cube_tensor_driver.simulation.source import simulate
 from cube_tensor_driver.touch.inverse import SurfaceInverse
 
 DEPTH, PITCH = 4e-3, 6e-3
-SCENES = package_data() / "config" / "mujoco"
+SCENES = find_package_data() / "config" / "mujoco"
 WEIGHT, FRICTION = 0.5 * 9.81, 0.6
 # A skin that is turned, with a flat box on it.
 BOX = """

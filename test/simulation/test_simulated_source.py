@@ -19,7 +19,7 @@ import yaml
 
 from conftest import ROOT
 from cube_tensor_driver.config.calibration import find_calibration, read_calibration
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.estimator import make_estimator
@@ -43,7 +43,7 @@ from cube_tensor_driver.simulation.load import Load, default_script
 from cube_tensor_driver.simulation.sample_log import SampleLog
 from cube_tensor_driver.simulation.source import simulate
 
-FILE = package_data() / "config" / "skin_demo.yaml"
+FILE = find_package_data() / "config" / "skin_demo.yaml"
 SKIN = read_skin(FILE)
 
 

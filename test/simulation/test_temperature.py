@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cube_tensor_driver.config.calibration import find_shipped_calibration
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.yaml import read_yaml
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.layout import LAYOUTS
@@ -84,7 +84,9 @@ def test_warm_pads_have_the_computed_stress_and_drift():
     """After hours, the whole layer is 10 K warmer: the pattern of a uniform temperature, and 1 per
     mille of the rest frequency; in between, pads lag behind the thermometer."""
     warm = ((0.0, 25.0), (60.0, 35.0))
-    stress = np.array(read_yaml(package_data() / "config/thermal/cube_11mm.yaml")["pads"])[:, 0]
+    stress = np.array(read_yaml(find_package_data() / "config/thermal/cube_11mm.yaml")["pads"])[
+        :, 0
+    ]
     pattern = cubes(temperature=warm, air=warm, pad_drift=0.0)
     both = cubes(temperature=warm, air=warm)
     assert np.abs(read_stress(pattern.frequency(*UNLOADED, 0.0))).max() < 0.01

@@ -33,7 +33,7 @@ from cube_tensor_driver.messages.codec import stress_codec
 from cube_tensor_driver.msg import SkinContacts, SkinStress, SkinTouch
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.domain import own_domain
-from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
+from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, list_skin_processes
 from cube_tensor_driver.ros.qos import batch_profile
 from cube_tensor_driver.simulation.sample_log import SampleLog, SampleTable
 from cube_tensor_driver.views.figures.style import save
@@ -285,7 +285,7 @@ def _make_processes(
     """Return the process of the load (hubs that send samples), followed by those of the nodes."""
     ports = path.parent / "ports"
     balls = write_balls(path.parent) if bench.has_load else None
-    processes = skin_processes(
+    processes = list_skin_processes(
         path,
         publish_period=bench.publish_period,
         composed=bench.composed,

@@ -25,7 +25,7 @@ from cube_tensor_driver.demo.running import observing
 from cube_tensor_driver.demo.usage import Usage
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.domain import own_domain
-from cube_tensor_driver.processes.skin_processes import VIEW, SimulatedHubs, skin_processes
+from cube_tensor_driver.processes.skin_processes import VIEW, SimulatedHubs, list_skin_processes
 
 RATE = 100.0
 """Sampling rate of each cube, in Hz."""
@@ -91,7 +91,7 @@ def measure(cubes: int) -> dict[str, float]:
         observer = stack.enter_context(observing("measure", children))
         hubs = SimulatedHubs(folder / "ports", instants=INSTANTS)
         skin = write_grid(folder / "skin.yaml", cubes, RATE, CUBES_PER_HUB)
-        for process in skin_processes(skin, markers=True, contacts=True, simulated=hubs):
+        for process in list_skin_processes(skin, markers=True, contacts=True, simulated=hubs):
             children.start(process)
         children.start(VIEW)
         url = children.wait_for_line("view", "http://", MAX_START_S).split()[0]

@@ -24,11 +24,11 @@ from cube_tensor_design.studies.pads_example import read_planar_calibration, swe
 from cube_tensor_design.studies.pads_study import compute_coarse_influence, compute_layer_example
 from cube_tensor_design.studies.traction_study import compute_traction_example
 from cube_tensor_driver.config.output_files import write_json
-from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.processes.children import Children
-from cube_tensor_driver.processes.skin_processes import VIEW, SimulatedHubs, skin_processes
+from cube_tensor_driver.processes.skin_processes import VIEW, SimulatedHubs, list_skin_processes
 from cube_tensor_driver.simulation.mujoco.scene import MujocoLoad, find_scene_skin
 from cube_tensor_driver.simulation.mujoco.source import load_mujoco
 from cube_tensor_driver.views.figures.style import save
@@ -133,7 +133,7 @@ def _draw_gripper(path: Path) -> None:
         ConfigError: There is no OpenGL.
     """
     os.environ.setdefault("MUJOCO_GL", "egl")
-    scene = package_data() / "config" / "mujoco" / "gripper.xml"
+    scene = find_package_data() / "config" / "mujoco" / "gripper.xml"
     skin = read_skin(find_scene_skin(scene))
     load = MujocoLoad(scene, skin, noise=None)
     load.at(SHAKEN_S)  # computes the scene up to this time
@@ -173,7 +173,7 @@ def _render(load: MujocoLoad) -> NDArray[np.uint8]:
 @contextmanager
 def _run_demo_skin() -> Iterator[Children]:
     """Run the simulated demo skin under its load, with the browser view."""
-    skin = package_data() / "config" / "skin_demo.yaml"
+    skin = find_package_data() / "config" / "skin_demo.yaml"
     with (
         tempfile.TemporaryDirectory(prefix="cube_pictures_") as name,
         Children(Path(name)) as children,
@@ -181,7 +181,7 @@ def _run_demo_skin() -> Iterator[Children]:
         load = Path(name) / "load.yaml"
         load.write_text(LOAD)
         hubs = SimulatedHubs(Path(name) / "ports", load=load, noise=None)
-        for process in skin_processes(skin, contacts=True, simulated=hubs):
+        for process in list_skin_processes(skin, contacts=True, simulated=hubs):
             children.start(process)
         children.start(VIEW)
         yield children

@@ -44,12 +44,12 @@ class MemoryMonitor:
         # A process that is being started again does not run for a moment.
         usage = Usage(self._children, running)
         for name, size_mb in usage.memory_mb().items():
-            sizes = self._sizes.setdefault(self._children.pid(name), [])
+            sizes = self._sizes.setdefault(self._children.find_pid(name), [])
             sizes.append((now_s, size_mb))
 
     def count_threads(self) -> dict[str, int]:
         """Return the number of threads of each process."""
-        ids = {name: self._children.pid(name) for name in self._names}
+        ids = {name: self._children.find_pid(name) for name in self._names}
         return {name: psutil.Process(pid).num_threads() for name, pid in ids.items()}
 
     def compute_growth_mb_per_min(self) -> float | None:

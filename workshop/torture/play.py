@@ -23,7 +23,7 @@ from cube_tensor_driver.core.arrays import AnyArray
 from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.demo.running import Observer, end_simulator
 from cube_tensor_driver.processes.children import Children
-from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
+from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, list_skin_processes
 from cube_tensor_driver.simulation.inject import format_fault
 from cube_tensor_driver.simulation.sample_log import SampleLog
 from cube_tensor_driver.simulation.simulator import FAULT_PIPE
@@ -183,7 +183,7 @@ def _make_processes(
     """Return the processes by name; the node `markers` is the other subscriber of stress."""
     hubs = SimulatedHubs(ports, sample_log=log_path, instants=INSTANTS)
     processes = {}
-    for process in skin_processes(
+    for process in list_skin_processes(
         skin_path,
         rate=RATE,
         markers=True,
