@@ -91,7 +91,7 @@ class Fit:
     undetermined: tuple[str, ...]
     advice: tuple[str, ...]
 
-    def calibration(
+    def make_calibration(
         self,
         base: Calibration,
         created: str = "",
@@ -128,7 +128,7 @@ class Fit:
         )
 
 
-def measured_stress(
+def compute_measured_stress(
     base: Calibration,
     frequency: ArrayLike,
     temperature: Array | None = None,
@@ -164,7 +164,7 @@ def measured_stress(
     return v
 
 
-def loads_from_forces(
+def compute_loads_from_forces(
     modes: Modes,
     force: Array,
     area: float,
@@ -229,7 +229,7 @@ def fit(
         fixed,
     )
     model = _Model(structure, sigma, fixed, gains)
-    design = model.design(x)
+    design = model.compute_design(x)
     theta, weights, scale = model.solve(design, y)
 
     jacobian = model.jacobian(theta, design)
@@ -263,7 +263,7 @@ def fit(
     # Rounding can make a variance that should be 0 slightly negative.
     gain_variance = np.diag(of_gains).clip(0)
 
-    def by_name(values: Array) -> dict[str, float]:
+    def name_coefficients(values: Array) -> dict[str, float]:
         """Return values (K,) of the coefficients by the names of the coefficients."""
         return dict(zip(structure.names, values.tolist(), strict=True))
 
@@ -272,8 +272,8 @@ def fit(
     n_determined = jacobian.shape[1] - null.shape[1]
     return Fit(
         structure=structure,
-        coefficients=by_name(coefficients),
-        deviations=by_name(deviations),
+        coefficients=name_coefficients(coefficients),
+        deviations=name_coefficients(deviations),
         covariance=of_coefficients,
         gain=gain,
         gain_deviation=np.sqrt(gain_variance),
@@ -336,7 +336,7 @@ class _Model:
         coordinates = theta[len(self.free) :]
         return coefficients, 1 + self.gains @ coordinates
 
-    def design(self, x: Array) -> Array:
+    def compute_design(self, x: Array) -> Array:
         """Return the change of each reading (stress on a pad under a load) per coefficient.
 
         All gains are taken as 1. The result has the shape (loads N, pads P, coefficients K).
@@ -578,7 +578,7 @@ def _advise(
         results = []
         for mode, load in enumerate(single_modes):
             candidate = np.vstack([loads, load])
-            jacobian = model.jacobian(theta, model.design(candidate))
+            jacobian = model.jacobian(theta, model.compute_design(candidate))
             new_null = find_null_space(jacobian)
             new_open = find_undetermined(new_null, len(names))
             # The best load leaves the fewest coefficients undetermined. Among loads that are equal

@@ -19,7 +19,7 @@ from ..core.errors import ConfigError, FitError
 from ..core.layout import Layout
 from ..core.modes import Modes
 from ..core.symmetry import choose_default_modes
-from .fit import loads_from_forces
+from .fit import compute_loads_from_forces
 
 FORCE = ("fx", "fy", "fz")
 """Names of the columns of a table of loads that hold the force on the cube, in N."""
@@ -42,7 +42,7 @@ class Loads:
     frequency: Array
     temperature: Array | None
 
-    def unloaded_frequency(self) -> Array | None:
+    def average_unloaded_frequency(self) -> Array | None:
         """Return the mean frequencies of the pads in the rows without load (P,), in Hz.
 
         The result is None if the table has no row without load.
@@ -164,7 +164,7 @@ def _read_states(
         )
     by_axis = [columns[name] for name in FORCE]
     force = np.stack(by_axis, axis=1)
-    return loads_from_forces(modes, force, area)
+    return compute_loads_from_forces(modes, force, area)
 
 
 def _read_cells(path: Path) -> tuple[list[str], Array]:

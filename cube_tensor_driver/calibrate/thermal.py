@@ -129,7 +129,7 @@ class ThermalFit:
     level: Array
     residual: Array
 
-    def sizes(self) -> tuple[float, float, float]:
+    def compute_sizes(self) -> tuple[float, float, float]:
         """Return the rms effect on the pads, before and after compensation, and the uncertainty.
 
         Returns:
@@ -145,7 +145,7 @@ class ThermalFit:
             root_mean_square(deviation[:, 0]),
         )
 
-    def calibration(self, base: Calibration, source: str) -> Calibration:
+    def make_calibration(self, base: Calibration, source: str) -> Calibration:
         """Return a calibration with the model, and rest frequencies at its reference temperature.
 
         Args:
@@ -427,7 +427,7 @@ def _check(
     """
     data, model = fit.data, fit.model
     worst = max(root_mean_square(pad) for pad in fit.residual.T)
-    stated = fit.sizes()[2]
+    stated = fit.compute_sizes()[2]
     size = max(stated / slope, change)
     fix = (
         "let nothing touch the skin, begin with half a minute at rest, warm it quickly, and record "

@@ -130,7 +130,7 @@ def run_table(options: argparse.Namespace) -> None:
 
     import numpy as np
 
-    from ..calibrate.fit import fit, measured_stress
+    from ..calibrate.fit import compute_measured_stress, fit
     from ..config.calibration import find_named_layout
     from ..config.output_files import write_json
     from ..core.errors import ConfigError
@@ -152,7 +152,7 @@ def run_table(options: argparse.Namespace) -> None:
     # response of the pads. Their average has given the rest frequencies.
     loaded = loads.state.any(axis=1)
     temperature = None if loads.temperature is None else loads.temperature[loaded]
-    measured = measured_stress(base, loads.frequency[loaded], temperature)
+    measured = compute_measured_stress(base, loads.frequency[loaded], temperature)
     structure = find_structure(layout, options.symmetry)
     result = fit(
         structure,
@@ -169,7 +169,7 @@ def run_table(options: argparse.Namespace) -> None:
     # The calibration file contains time and source, so that its origin can be found later.
     created = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
     table = options.loads.name
-    calibration = result.calibration(base, created, f"fit of {table}, {len(measured)} loads")
+    calibration = result.make_calibration(base, created, f"fit of {table}, {len(measured)} loads")
     words = f"{table} --layout {options.layout} --symmetry {options.symmetry}"
     save(draw_fit(result, measured), options.figure)
     write_result(options.output, calibration, words)
@@ -190,11 +190,11 @@ def run_rest(options: argparse.Namespace) -> None:
     for name, result in fits.items():
         lags = " + ".join(f"{lag:.0f}" for lag in result.model.lag.tolist())
         degree = str(result.model.coefficient.shape[1])
-        rows.append((name, lags, degree, *(f"{size:.2f}" for size in result.sizes())))
+        rows.append((name, lags, degree, *(f"{size:.2f}" for size in result.compute_sizes())))
     print_table(("cube",), columns, rows)
     for name, result in fits.items():
         base, _ = warming[name]
-        calibration = result.calibration(base, f"{base.source}; temperature fitted to {bags}")
+        calibration = result.make_calibration(base, f"{base.source}; temperature fitted to {bags}")
         path, picture = options.output, options.figure
         if len(fits) > 1:
             path, picture = (one.with_stem(f"{one.stem}_{name}") for one in (path, picture))
@@ -303,7 +303,7 @@ def read_inputs(
         )
     else:
         loads = read_loads(options.loads, layout, options.area)
-        rest, rest_source = loads.unloaded_frequency(), "of the rows without load"
+        rest, rest_source = loads.average_unloaded_frequency(), "of the rows without load"
 
     if options.base is not None:
         base = read_calibration(find_calibration(options.base, Path()))

@@ -8,7 +8,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cube_tensor_driver.calibrate.fit import describe_mode, fit, loads_from_forces, measured_stress
+from cube_tensor_driver.calibrate.fit import (
+    compute_loads_from_forces,
+    compute_measured_stress,
+    describe_mode,
+    fit,
+)
 from cube_tensor_driver.core.calibration import Calibration, illustrative
 from cube_tensor_driver.core.errors import FitError
 from cube_tensor_driver.core.modes import SPACE
@@ -122,7 +127,7 @@ def test_what_the_loads_leave_open_is_said_and_following_the_advice_settles_it()
         and "add a load of zz_x alone, sigma_zz growing along x" in result.advice[0]
     )
     with pytest.raises(FitError, match=r"do not determine e, f.*fixed"):
-        result.calibration(bench.base)
+        result.make_calibration(bench.base)
     advised = [text.split("a load of ")[1].split()[0] for text in result.advice]
     extra = 1e4 * np.eye(7)[bench.structure.modes.index(advised)]
     bench.loads = np.vstack([bench.loads, extra])
@@ -132,7 +137,7 @@ def test_what_the_loads_leave_open_is_said_and_following_the_advice_settles_it()
     known = {n: bench.coefficients[n] for n in "efgh"}
     settled = bench.fit(fixed=known)
     assert not settled.undetermined and settled.coefficients["g"] == known["g"]
-    assert settled.calibration(bench.base).coefficients["g"] == known["g"]
+    assert settled.make_calibration(bench.base).coefficients["g"] == known["g"]
 
 
 def test_loads_in_proportion_are_not_told_apart():
@@ -146,7 +151,7 @@ def test_loads_in_proportion_are_not_told_apart():
 def test_a_fit_becomes_a_calibration():
     bench = Bench("planar", "mirrors", 6)
     result = bench.fit()
-    c = result.calibration(bench.base, created="2024-05-01T12:00:00Z", source="loads.csv")
+    c = result.make_calibration(bench.base, created="2024-05-01T12:00:00Z", source="loads.csv")
     assert (
         c.symmetry == "mirrors"
         and c.source == "loads.csv"
@@ -162,16 +167,16 @@ def test_readings_from_frequencies():
     )
     v = np.random.default_rng(0).normal(size=(5, 8)) * 1e3
     f = pad_frequency(v, c.rest_frequency * 1.001, c.beta, c.modulus)
-    np.testing.assert_allclose(measured_stress(c, f, np.full(5, 35.0)), v, atol=1e-6)
+    np.testing.assert_allclose(compute_measured_stress(c, f, np.full(5, 35.0)), v, atol=1e-6)
     f[2, 3] = 1e9
     with pytest.raises(FitError, match=r"load 3, pad -z\+x: 1e\+09 Hz"):
-        measured_stress(c, f)
+        compute_measured_stress(c, f)
     with pytest.raises(FitError, match=r"\(5, 4\).*8"):
-        measured_stress(c, f[:, :4])
+        compute_measured_stress(c, f[:, :4])
 
 
 def test_loads_from_a_reference_force_sensor():
-    states = loads_from_forces(SPACE, np.array([[1.0, 2, -3]]), 1e-4)
+    states = compute_loads_from_forces(SPACE, np.array([[1.0, 2, -3]]), 1e-4)
     assert dict(zip(SPACE.names, states[0], strict=True)) | {
         "zz": -3e4,
         "zx": 1e4,
@@ -179,7 +184,7 @@ def test_loads_from_a_reference_force_sensor():
     } == dict(zip(SPACE.names, states[0], strict=True))
     assert np.count_nonzero(states) == 3
     with pytest.raises(FitError, match="area"):
-        loads_from_forces(SPACE, np.ones((1, 3)), 0)
+        compute_loads_from_forces(SPACE, np.ones((1, 3)), 0)
 
 
 def test_without_gains_fewer_loads_are_enough():
@@ -219,7 +224,7 @@ def test_what_cannot_be_fitted_is_an_error_with_its_reason(change, words):
 
 def test_one_load_alone_settles_no_coefficient():
     c = illustrative("cube")
-    loads = loads_from_forces(c.modes, np.array([[0, 0, -1.0]]), 1e-4)
+    loads = compute_loads_from_forces(c.modes, np.array([[0, 0, -1.0]]), 1e-4)
     with pytest.raises(FitError, match=r"determine no coefficient.*add a load of"):
         fit(c.structure, loads, loads @ c.response.T)
 
