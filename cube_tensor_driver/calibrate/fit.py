@@ -357,7 +357,7 @@ class _Model:
 
         Args:
             theta: Parameters (coefficients, then coordinates of the gains).
-            design: Result of `design` for the loads (N, P, K), in Pa.
+            design: Result of `compute_design` for the loads (N, P, K), in Pa.
         """
         coefficients, gain = self.unpack(theta)
         readings: Array = gain * (design @ coefficients)
@@ -372,7 +372,7 @@ class _Model:
 
         Args:
             theta: Parameters (coefficients, then coordinates of the gains).
-            design: Result of `design` for N loads (N, P, K), in Pa.
+            design: Result of `compute_design` for N loads (N, P, K), in Pa.
 
         Returns:
             Derivatives (N P, parameters), divided by the noise of the pad.
@@ -395,7 +395,7 @@ class _Model:
         """Fit the parameters to readings: with equal, then Huber's, then Tukey's weights.
 
         Args:
-            design: Result of `design` for the loads (N, P, K), in Pa.
+            design: Result of `compute_design` for the loads (N, P, K), in Pa.
             y: Measured pad stresses (N, P), in Pa.
 
         Returns:
@@ -510,7 +510,7 @@ def _cross_validate(
 
     Args:
         model: The model.
-        design: Result of `_Model.design` for the loads (N, P, K), in Pa.
+        design: Result of `_Model.compute_design` for the loads (N, P, K), in Pa.
         y: Measured pad stresses (N, P), in Pa.
         is_used: Whether a reading (stress on a pad under a load) is no outlier (N, P).
 

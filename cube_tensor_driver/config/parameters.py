@@ -60,7 +60,8 @@ class Parameter(NamedTuple):
     def parse(self, text: str) -> Any:
         """Convert a text into a value of the parameter's type: bool, float or str.
 
-        If the parameter is a number but the text is not, the result is NaN. `find_refusal` reports it.
+        If the parameter is a number but the text is not, the result is NaN, which `find_refusal`
+        reports.
         """
         if isinstance(self.default, bool):
             return text.lower() == "true"

@@ -228,7 +228,7 @@ class LiveLinks:
         """
         return self._scans.cubes.uids
 
-    def row_counts(self) -> RowCounts:
+    def count_rows(self) -> RowCounts:
         """Return how many rows have been delivered, left out for each reason, or lost so far.
 
         A row is one sample of one cube.
@@ -267,7 +267,7 @@ class LiveLinks:
             self._handle_received(received)
         self._was_clock_set = False
         self._deliver()
-        self._rows.check(self._scans.rows_waiting())
+        self._rows.check(self._scans.count_rows_waiting())
 
     def _is_overloaded(self) -> bool:
         """Return whether scans (one sample of every cube) must be dropped, as the host is too slow.
@@ -404,7 +404,7 @@ class LiveLinks:
 
     def _count_error(self, error: Exception) -> None:
         """Count and log an error, and count the rows (samples of cubes) that it has lost."""
-        lost = self._rows.count_lost(self._scans.rows_waiting(), error)
+        lost = self._rows.count_lost(self._scans.count_rows_waiting(), error)
         self._errors += 1
         if self._errors in LOGGED_ERRORS:
             self._log.error(
@@ -464,7 +464,7 @@ def _report(link: Link, record: _LinkRecord, lag_s: float) -> LinkReport:
         record: Data that is kept for the link.
         lag_s: Longest time since the last report for which received bytes waited to be read, in s.
     """
-    counters = record.account.counters()
+    counters = record.account.count_samples()
     notes = [] if link.error is None else [str(link.error)]
     notes += _describe_losses(record.reported, counters, lag_s)
     notes += record.problems

@@ -172,7 +172,7 @@ class LinkSource:
         cube or has it with another number of pads. The notes of a link include the problems since
         the last call.
         """
-        counts = self._links.row_counts()
+        counts = self._links.count_rows()
         links = {
             report.name: {
                 "state": report.state.value,
@@ -187,7 +187,7 @@ class LinkSource:
                 "rows given": self._given,
                 "rows waiting": waiting,
                 "rows dropped": self._dropped,
-                **counts.not_delivered(),
+                **counts.count_not_delivered(),
                 "links": links,
             }
 

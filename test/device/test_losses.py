@@ -122,7 +122,7 @@ def test_samples_dropped_in_the_hub_count_from_our_start_or_its_restart_on() -> 
             for first in (0, 40):
                 account.classify(sample(number, first=first, n_cubes=40))
         account.add_stats(stats)
-        counters = account.counters()
+        counters = account.count_samples()
         return counters["dropped_in_hub"], counters["lost_on_the_way"]
 
     assert places(500, stats=Stats(1000, 501, 100)) == (0, 0)
@@ -197,7 +197,7 @@ def test_samples_repeated_late_are_repeats_and_nothing_else(link) -> None:
 
 
 def live_duplicates(link: OneLink) -> int:
-    return link.live.row_counts().duplicate
+    return link.live.count_rows().duplicate
 
 
 @pytest.mark.parametrize("told_by", [Ack(Command.START), Stats(1, 0, 0), LinkState.WAITING])
@@ -237,7 +237,7 @@ def test_a_hub_that_announces_fewer_cubes_is_counted_right() -> None:
         values, losses = link.report()
         assert losses == [] and values["taken"] == values["delivered"] == 30 + 2 * 10 + 1
         assert values["hub changes"] == 3
-        assert link.live.row_counts().unaccounted == 0
+        assert link.live.count_rows().unaccounted == 0
     finally:
         link.close()
 
@@ -249,7 +249,7 @@ def test_frames_of_cubes_that_the_hub_does_not_have_are_not_remembered() -> None
         account.classify(sample(0, first=first))
     account.add_stats(Stats(10, 1, 0))
     assert len(account._trackers) == 8
-    counters = account.counters()
+    counters = account.count_samples()
     assert (counters["delivered"], counters["lost_on_the_way"]) == (20_000, 0)
 
 
@@ -340,7 +340,7 @@ class SlowHost:
             self.lost += due - waiting.stop
             self.now_s += 0.5e-3
             self._give([sample(number, 1000 * number + 1) for number in waiting])
-        assert self.live.row_counts().unaccounted == 0
+        assert self.live.count_rows().unaccounted == 0
 
     def _give(self, samples: list[Sample]) -> None:
         stamps_ns = [1000 * one.device_us for one in samples]
@@ -366,7 +366,7 @@ def test_a_host_that_is_too_slow_loses_what_exceeds_its_capacity(
         pytest.skip("was not compiled")
     host = SlowHost(monkeypatch, scan_ms, as_usual)
     host.run(4000)
-    counts = host.live.row_counts()
+    counts = host.live.count_rows()
     assert counts.delivered + counts.overload == 2 * (4000 - host.lost)
     assert host.lost < 500, "only until it is certain that the host is too slow"
     assert counts.delivered / 8000 == pytest.approx(share, abs=0.1 * share)
@@ -380,7 +380,7 @@ def test_a_short_pause_of_the_host_loses_nothing(monkeypatch) -> None:
     host.run(100)
     host.now_s += 0.4
     host.run(2000)
-    counts = host.live.row_counts()
+    counts = host.live.count_rows()
     assert counts.overload == 0 and counts.delivered == 2 * (2000 - host.lost)
 
 
@@ -390,6 +390,6 @@ def test_a_host_that_is_always_behind_but_loses_nothing_drops_nothing(monkeypatc
     host.BUFFER = 1000
     host.now_s = 0.2
     host.run(3000)
-    counts = host.live.row_counts()
+    counts = host.live.count_rows()
     assert (counts.overload, counts.delivered) == (0, 6000)
     assert host.live._reader.behind_s > 1.0

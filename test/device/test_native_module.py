@@ -237,7 +237,7 @@ def test_usual_samples_have_the_same_stamps_and_counters_in_c(seed: int) -> None
             device_us = arrival_ns // 1000 + step_us + 50
             for link in (here, there):
                 link.clock.add_answer(arrival_ns, device_us, arrival_ns + 100_000)
-        assert here.account.counters() == there.account.counters()
+        assert here.account.count_samples() == there.account.count_samples()
         for name in LinkTrack.__annotations__:
             if name not in ("is_native_allowed", "n_native", "seen"):
                 assert getattr(here.track, name) == getattr(there.track, name), name

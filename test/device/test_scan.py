@@ -111,7 +111,7 @@ def test_a_link_that_was_late_once_does_not_stay_a_sample_behind():
     assert taken() == [1] * 4, "the second was late once: what the first has given more waits"
     assert taken() is None
     give(1, 2)
-    assert taken() == [2] * 4 and scan.rows_waiting() == 0
+    assert taken() == [2] * 4 and scan.count_rows_waiting() == 0
     give(0, 3), give(0, 4)
     assert taken() == [3, 3, 4, 4], "nothing from the second: nobody waits for it any longer"
     give(1, 3)
@@ -119,7 +119,7 @@ def test_a_link_that_was_late_once_does_not_stay_a_sample_behind():
     give(0, 5), give(1, 4), give(1, 5)
     assert [taken(), taken(), taken()] == [[5, 5, 4, 4], [5, 5], None]
     give(0, 6), give(1, 6)
-    assert taken() == [6] * 4 and scan.rows_waiting() == 0
+    assert taken() == [6] * 4 and scan.count_rows_waiting() == 0
 
 
 def taken(scan, max_scans=None):
@@ -144,7 +144,9 @@ def test_links_that_are_late_by_different_times_make_whole_scans():
     give(0, 1, 2), give(1, 7, 8)
     assert taken(scan) == [[1, 7, 2, 8]]
     give(0, 3), give(1, 9, 10)
-    assert taken(scan) == [[3, 9]] and scan.rows_waiting() == 2, "the second has given one more"
+    assert taken(scan) == [[3, 9]] and scan.count_rows_waiting() == 2, (
+        "the second has given one more"
+    )
     give(0, 4), give(1, 11)
     assert taken(scan) == [[4, 10]]
     give(0, 5, 6), give(1, 12, 13, 14)
@@ -175,7 +177,7 @@ def test_each_sample_is_built_once_and_in_order(turns, max_scans):
             rows = scan.build(max_scans=max_scans)
             for link, cubes in enumerate(((1, 2), (0, 3))):
                 built[link] += rows.sequence[np.isin(rows.cube, cubes)][::2].tolist()
-    assert built == [list(range(count)) for count in given] and scan.rows_waiting() == 0
+    assert built == [list(range(count)) for count in given] and scan.count_rows_waiting() == 0
 
 
 @pytest.mark.parametrize("begins, lost", [(1, ()), (3, ()), (4, ()), (0, (11, 12))])
@@ -192,7 +194,7 @@ def test_what_a_link_has_not_sent_does_not_keep_batches_small(begins, lost):
                 sizes.append(len(rows))
     assert set(sizes[4:]) == {5 * 2 * 2}
     sent = 60 * 2 * 2 - 2 * (begins + len(lost))
-    assert sum(sizes) + scan.rows_waiting() == sent and scan.rows_waiting() < 5 * 2 * 2
+    assert sum(sizes) + scan.count_rows_waiting() == sent and scan.count_rows_waiting() < 5 * 2 * 2
 
 
 def test_a_sample_in_two_frames_goes_on_at_once():
@@ -201,7 +203,7 @@ def test_a_sample_in_two_frames_goes_on_at_once():
     for link, stamp_ns in ((0, 1010), (0, 1010), (1, 1000)):
         scan.add(link, sample(0, [[1.0, 1.0]]), stamp_ns)
     taken = [len(scan.build().cube) for _ in range(2) if scan.is_complete()]
-    assert taken == [2, 1] and not scan.is_complete() and scan.rows_waiting() == 0
+    assert taken == [2, 1] and not scan.is_complete() and scan.count_rows_waiting() == 0
 
 
 def test_not_measured_is_nan_and_millihertz_survive():
@@ -273,7 +275,7 @@ def test_two_cubes_with_one_uid_give_rows_of_one():
     scan.add(1, sample(0, [[4.0, 4.0], [5.0, 5.0]]), 0)
     rows = scan.build()
     assert rows.cube.tolist() == [0, 1] and rows.frequency[:, 0].tolist() == [1.0, 3.0]
-    assert scan.counts.unknown_cube == 3 and scan.rows_waiting() == 0
+    assert scan.counts.unknown_cube == 3 and scan.count_rows_waiting() == 0
     assert scan.cubes.learn(1, hello([5, 7])) is None
     scan.forget(0)
     assert scan.cubes.learn(1, hello([5, 7])) == [
@@ -305,7 +307,7 @@ def test_batches_hold_the_first_samples_of_all_links_then_the_second_ones():
     assert first.stamp_ns.tolist() == [0, 0, 1, 1, 100, 100, 101, 101]
     assert first.frequency[:, 0].tolist() == [1, 1, 11, 11, 2, 2, 12, 12]
     assert second.sequence.tolist() == [2, 2, 2, 2]
-    assert scan.build() is None and scan.rows_waiting() == 0
+    assert scan.build() is None and scan.count_rows_waiting() == 0
 
 
 class LinesLog:
@@ -400,7 +402,7 @@ def test_stamps_use_the_arrival_of_their_own_read():
         (0, 2): 30_000,
         (1, 1): 35_000,
     }
-    assert live.row_counts() == RowCounts(delivered=5)
+    assert live.count_rows() == RowCounts(delivered=5)
 
 
 def live_links(on_rows, n_cubes=1):
@@ -422,7 +424,7 @@ def test_rows_that_are_left_out_do_not_pile_up(strange):
         live.receive([LinkFrames(0, 1_000_000 * numbers[-1], frames)])
     assert not given
     left_out = 0 if "n_cubes" in strange else 2000
-    counts = live.row_counts()
+    counts = live.count_rows()
     assert (counts.unknown_cube + counts.wrong_pads, counts.unaccounted) == (left_out, 0)
     live.receive([LinkFrames(0, 2_000_000_000, [sample_frame(2000, 2_000_000)])])
     assert [rows.sequence.tolist() for rows in given] == [[2000]], "older ones come first"
@@ -442,7 +444,7 @@ def test_no_device_time_loses_a_row():
             frames.append(sample_frame(sequence, device_us))
             sequence += 1
         live.receive([LinkFrames(0, arrival_ns, frames)])
-    counts = live.row_counts()
+    counts = live.count_rows()
     assert (counts.delivered, counts.lost, counts.unaccounted) == (sequence, 0, 0)
     for rows in given:
         assert rows.stamp_ns.max() <= arrival_ns
@@ -453,7 +455,7 @@ def test_a_long_read_of_times_that_fall_back_is_taken():
     live = live_links(lambda rows: None)
     frames = [sample_frame(number, 2_000_000 * (5000 - number)) for number in range(5000)]
     live.receive([LinkFrames(0, 10**18, frames)])
-    assert live.row_counts().delivered == 5000
+    assert live.count_rows().delivered == 5000
 
 
 def test_rows_far_apart_in_time_are_given_one_after_the_other():
@@ -471,7 +473,7 @@ def test_rows_far_apart_in_time_are_given_one_after_the_other():
     )
     stamps = sorted((rows.stamp_ns / second).tolist() for rows in given[1:])
     assert stamps == [[1.0], [5.0, 5.0]]
-    assert live.row_counts() == RowCounts(delivered=5)
+    assert live.count_rows() == RowCounts(delivered=5)
 
 
 def test_an_error_in_the_callback_is_counted_with_its_reason_and_the_next_rows_go_on():
@@ -487,7 +489,7 @@ def test_an_error_in_the_callback_is_counted_with_its_reason_and_the_next_rows_g
         frames = [sample_frame(number, 1000 * number, n_cubes=3)] * 2
         live.receive([LinkFrames(0, 1_000_000 * number, frames)])
     assert [int(rows.sequence[0]) for rows in given] == [0, 2, 3]
-    assert live.row_counts() == RowCounts(
+    assert live.count_rows() == RowCounts(
         delivered=9, duplicate=12, lost=3, lost_reason="ValueError('full')"
     )
     assert live.callback_errors == 1
@@ -498,7 +500,7 @@ def test_rows_that_the_data_path_forgets_without_an_error_are_unaccounted(monkey
     live = live_links(lambda rows: None)
     monkeypatch.setattr(ScanBuilder, "add", lambda self, link, sample, stamp_ns, status: None)
     live.receive([LinkFrames(0, 0, [sample_frame(0, 0)])])
-    assert live.row_counts() == RowCounts(unaccounted=1)
+    assert live.count_rows() == RowCounts(unaccounted=1)
 
 
 def test_rows_that_wait_for_their_scan_are_neither_lost_nor_unaccounted():
@@ -507,11 +509,11 @@ def test_rows_that_wait_for_their_scan_are_neither_lost_nor_unaccounted():
     live = LiveLinks(links, addresses, lambda rows: None)
     live.receive([LinkFrames(link, 0, [hello([link + 1]), sample_frame(0, 0)]) for link in (0, 1)])
     live.receive([LinkFrames(0, 1_000_000, [sample_frame(1, 1000)])])
-    assert live.row_counts() == RowCounts(delivered=2)
+    assert live.count_rows() == RowCounts(delivered=2)
     live._count_error(OSError())
-    assert live.row_counts().lost == 0
+    assert live.count_rows().lost == 0
     live.receive([LinkFrames(1, 1_000_000, [sample_frame(1, 1000)])])
-    assert live.row_counts() == RowCounts(delivered=4, lost_reason="OSError()")
+    assert live.count_rows() == RowCounts(delivered=4, lost_reason="OSError()")
 
 
 @pytest.mark.parametrize("step_ns", [5_000_000, -3_600_000_000_000])

@@ -171,7 +171,7 @@ def test_each_count_of_the_driver_is_in_its_pair():
         lost=5,
         lost_reason="OSError()",
     )
-    links = SimpleNamespace(row_counts=lambda: replace(counts))
+    links = SimpleNamespace(count_rows=lambda: replace(counts))
     diagnostics = LinkDiagnostics("skin")
 
     def report():
@@ -264,7 +264,7 @@ def test_an_inactive_node_says_so_and_blames_no_cube():
 def test_losses_of_a_link_are_a_warning_and_coloured_on_the_page(states, notes, level):
     state, *past_states = states
     report = LinkReport("hub0", 0xAB, state, tuple(past_states), notes, {"lost_on_the_way": 5})
-    links = SimpleNamespace(row_counts=RowCounts, report=lambda: [report])
+    links = SimpleNamespace(count_rows=RowCounts, report=lambda: [report])
     rows, link = LinkDiagnostics("skin").statuses(links, with_links=True)
     assert (rows.level, link.level) == (b"\0", level)
     assert (link.name, link.hardware_id) == ("link hub0", "0xab")

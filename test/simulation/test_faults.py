@@ -80,7 +80,7 @@ def test_harmed_frames_are_delivered_or_missing_never_wrong(kind):
     account = SampleAccount()
     arrivals = [account.classify(sample) for sample in samples]
     account.add_stats(Stats(10_000, link.hub.sequence, 0))
-    counters = account.counters()
+    counters = account.count_samples()
     assert counters["delivered"] + counters["duplicate"] == len(samples)
     assert counters["taken"] == 100 == counters["delivered"] + counters["lost_on_the_way"]
     for sample in samples:
@@ -107,10 +107,12 @@ def test_stats_complete_the_account_and_tell_drops_from_loss():
     for sample in samples[:6]:
         account.classify(sample)
     account.add_stats(Stats(20, 10, 3))
-    assert account.counters()["taken"] == 10
-    assert (account.counters()["dropped_in_hub"], account.counters()["lost_on_the_way"]) == (3, 1)
+    counters = account.count_samples()
+    assert counters["taken"] == 10
+    assert (counters["dropped_in_hub"], counters["lost_on_the_way"]) == (3, 1)
     assert account.classify(samples[7]) is Arrival.LATE
-    assert account.counters()["lost_on_the_way"] + account.counters()["dropped_in_hub"] == 3
+    counters = account.count_samples()
+    assert counters["lost_on_the_way"] + counters["dropped_in_hub"] == 3
 
 
 def test_faults_of_pads_and_hub_change_what_the_hub_says():

@@ -107,7 +107,7 @@ class ClockLine:
             Whether the points show that the hub's or the host's clock was set.
         """
         track = self._track
-        height = self.height(device_ns, arrival_ns)
+        height = self.compute_height(device_ns, arrival_ns)
         if height < 0:
             track.offset += height
             track.bucket_height = math.inf

@@ -246,13 +246,13 @@ class Reader:
                 self._drop(i, error)
             while self._periods:
                 i, period_us = self._periods.popleft()
-                with self._closing_on_error(i) as session:
+                with self._close_on_error(i) as session:
                     session.set_period(period_us)
             now = time.monotonic()
             if now >= tick_at:
                 tick_at = now + TICK_S
                 for i, link in enumerate(self.links):
-                    with self._closing_on_error(i) as session:
+                    with self._close_on_error(i) as session:
                         if link.is_open:
                             session.check_timers(now)
                         elif session.open(now):
@@ -311,7 +311,7 @@ class Reader:
         self._gather_s = min(MAX_WAIT_PERIODS * period_s, MAX_WAIT_S)
 
     @contextlib.contextmanager
-    def _closing_on_error(self, i: int) -> Iterator[Session]:
+    def _close_on_error(self, i: int) -> Iterator[Session]:
         """Yield the session of a link; close the link if the `with` block raises a LinkError."""
         try:
             yield self._sessions[i]

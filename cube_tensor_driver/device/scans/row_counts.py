@@ -39,7 +39,7 @@ class RowCounts:
     lost_reason: str = ""
     received: int = field(default=0, compare=False)
 
-    def not_delivered(self) -> dict[str, int]:
+    def count_not_delivered(self) -> dict[str, int]:
         """Return the numbers of rows that were not delivered, by a description for people."""
         return {
             "rows of unknown cubes": self.unknown_cube,

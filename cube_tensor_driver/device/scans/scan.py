@@ -215,7 +215,7 @@ class ScanBuilder:
         n_dropped = max(0, len(self._pending) - n_kept)
         return _count_rows(self._remove_scans(n_dropped))
 
-    def rows_waiting(self) -> int:
+    def count_rows_waiting(self) -> int:
         """Return how many rows (samples of cubes) were added, but not yet built or left out."""
         n_deferred = sum(len(part.cubes) for part in self._deferred)
         return n_deferred + _count_rows(self._pending)

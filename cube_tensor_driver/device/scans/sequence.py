@@ -384,15 +384,15 @@ class SampleAccount:
     @property
     def missing(self) -> int:
         """Number of samples that the hub has taken, by their numbers, but that have not come."""
-        return self._total().missing
+        return self._sum_parts().missing
 
-    def counters(self) -> dict[str, int]:
+    def count_samples(self) -> dict[str, int]:
         """Return the numbers of samples by name.
 
         Two sums hold: taken = delivered + dropped_in_hub + lost_on_the_way, and received =
         delivered + duplicate.
         """
-        total = asdict(self._total())
+        total = asdict(self._sum_parts())
         missing = total.pop("missing")
         total["delivered"] += self._track.n_native
         # Missing samples count as lost on the way until a STATS frame reports that the hub has

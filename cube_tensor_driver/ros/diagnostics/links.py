@@ -39,7 +39,7 @@ class LinkDiagnostics:
             with_links: Whether the list contains a status for each link, after the status about all
                 rows.
         """
-        counts = links.row_counts()
+        counts = links.count_rows()
         statuses = [_make_rows_status(self._skin_name, counts, self._counts_before)]
         self._counts_before = counts
         if with_links:
@@ -78,7 +78,7 @@ def _make_rows_status(
     values = {
         "rows published": counts.delivered,
         "rows per second": counts.delivered - before.delivered,
-        **counts.not_delivered(),
+        **counts.count_not_delivered(),
     }
     return make_status(
         "rows",
