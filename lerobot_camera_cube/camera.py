@@ -106,7 +106,7 @@ class CubeCamera(Camera):  # type: ignore[misc]
         """
         if self._live is None:
             raise DeviceNotConnectedError(f"skin {self._config.skin} is not connected")
-        return self._live.next_picture(timeout_ms / 1000)
+        return self._live.take_next_picture(timeout_ms / 1000)
 
     def read_latest(self, max_age_ms: int = 500) -> AnyArray:
         """Return a picture of the skin and record the samples since the last one.

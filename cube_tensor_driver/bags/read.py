@@ -536,7 +536,7 @@ class Bag:
         for _, stored in self._read_stored({topic}):
             for times_ns, messages in stored.group_by_length():
                 first = messages[0].tobytes()
-                new_shape = len(first), codec.shape_bytes(first)
+                new_shape = len(first), codec.read_shape_bytes(first)
                 begin = 0
                 while begin < len(messages):
                     if new_shape != shape or not room:

@@ -152,7 +152,7 @@ class BagSource:
             health: Recorded health of the pads for their rows, or None.
         """
         n_rows = len(messages.rows) // len(messages)
-        cube = messages.by_message(messages.rows.cube)
+        cube = messages.group_by_message(messages.rows.cube)
         info_index = self._find_infos(messages)
         compensation = self.recording.compensation
         recorded = [compensation.find(stamp_ns) for stamp_ns in messages.stamp_ns.tolist()]
@@ -182,7 +182,7 @@ class BagSource:
 
     def _find_infos(self, messages: Decoded[FrequencyRows]) -> Index:
         """Return the indices (M,) in `Recording.infos` of the SkinInfo for each of M messages."""
-        times_ns = messages.by_message(messages.rows.stamp_ns)
+        times_ns = messages.group_by_message(messages.rows.stamp_ns)
         # A message without rows has no newest row, so the stamp in its header is used.
         newest_ns: Times = times_ns.max(axis=1) if times_ns.size else messages.stamp_ns
         return self.recording.info_index_at(newest_ns)

@@ -176,11 +176,13 @@ def _write_bag(
     """
     with open_bag(plan.path, choices.frequencies) as source:
         streams = {topic.key: topic.open(source.bag) for topic in topics}
-        blocks = [block for episode in plan.episodes for block in episode.blocks(choices.fps)]
+        blocks = [
+            block for episode in plan.episodes for block in episode.divide_into_blocks(choices.fps)
+        ]
         rows = _find_stress(data_set, plan, source, choices)
         windows = stream_windows(rows, blocks, plan.counts, depth)
         for episode in plan.episodes:
-            for block in episode.blocks(choices.fps):
+            for block in episode.divide_into_blocks(choices.fps):
                 ends_ns = plan.edges_ns[block.start : block.stop]
                 columns = {key: stream.at(ends_ns) for key, stream in streams.items()}
                 data_set.write({**next(windows), **columns}, episode.task)

@@ -119,7 +119,7 @@ class LiveWindows:
         self._folder = folder
         self._source = source
         self._full_scale = full_scale
-        self._cube_at = nearest_cubes(
+        self._cube_at = find_nearest_cubes(
             source.skin,
             width,
             height,
@@ -133,7 +133,7 @@ class LiveWindows:
         self._thread = threading.Thread(target=self._collect, daemon=True)
         self._thread.start()
 
-    def next_picture(self, timeout_s: float) -> AnyArray:
+    def take_next_picture(self, timeout_s: float) -> AnyArray:
         """Write all samples since the last call as one window and return the frame's picture.
 
         Args:
@@ -281,7 +281,7 @@ class RecordedWindows:
         Raises:
             BagError: The folder has no window with the number in the picture.
         """
-        return self.at(frame_number(picture))
+        return self.at(read_frame_number(picture))
 
     def at(self, number: int) -> dict[str, AnyArray]:
         """Return the window that was stored under a frame number; result and errors as in `of`."""
@@ -292,7 +292,7 @@ class RecordedWindows:
         return {name: as_array(batch[name])[0] for name in names if name != NUMBER_COLUMN}
 
 
-def frame_number(picture: AnyArray) -> int:
+def read_frame_number(picture: AnyArray) -> int:
     """Read the frame number (time of reading, in ms since the Unix epoch) from a picture.
 
     Args:
@@ -317,7 +317,7 @@ def frame_number(picture: AnyArray) -> int:
     return int.from_bytes(number.tobytes(), "big")
 
 
-def nearest_cubes(skin: Skin, width: int, height: int) -> AnyArray:
+def find_nearest_cubes(skin: Skin, width: int, height: int) -> AnyArray:
     """Return the number of the cube that each pixel of a picture shows, (height, width).
 
     The skin is seen along its thinnest direction, and each pixel shows the nearest cube.

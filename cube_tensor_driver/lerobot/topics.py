@@ -232,11 +232,11 @@ def _number_paths(msgtype: str) -> list[str]:
     fields = list_message_fields(msgtype)
     if not fields or fields[0][1] != HEADER_KIND or msgtype.startswith(PACKAGE):
         return []
-    paths = list(_nested_paths(fields[1:], ""))
+    paths = list(_find_nested_paths(fields[1:], ""))
     return [] if None in paths else [path for path in paths if path]
 
 
-def _nested_paths(fields: Fielddefs, prefix: str) -> Iterator[str | None]:
+def _find_nested_paths(fields: Fielddefs, prefix: str) -> Iterator[str | None]:
     """Yield the paths of the numbers in some fields, including those in nested messages.
 
     Args:
@@ -253,7 +253,7 @@ def _nested_paths(fields: Fielddefs, prefix: str) -> Iterator[str | None]:
         # For a list of fixed length, the second element of its kind is (kind of element, length).
         kind = field_kind[1][0] if field_kind[0] == Nodetype.ARRAY else field_kind
         if field_kind[0] == Nodetype.NAME:
-            yield from _nested_paths(list_message_fields(field_kind[1]), f"{prefix}{name}.")
+            yield from _find_nested_paths(list_message_fields(field_kind[1]), f"{prefix}{name}.")
         elif kind[0] != Nodetype.BASE:
             yield None
         elif kind[1][0] != "string":

@@ -165,7 +165,7 @@ class Decoded(Generic[AnyRows]):
         rows = self.rows.select(slice(begin * n_rows, end * n_rows))
         return Decoded(rows, self.stamp_ns[chosen], self.frame_id)
 
-    def by_message(self, column: AnyArray) -> AnyArray:
+    def group_by_message(self, column: AnyArray) -> AnyArray:
         """Reshape a column of `rows` so that its first axis counts the messages.
 
         Args:
@@ -286,7 +286,7 @@ class MessageCodec(Generic[AnyRows]):
             columns.append(_read_column(record, name))
         return columns
 
-    def shape_bytes(self, data: bytes) -> bytes:
+    def read_shape_bytes(self, data: bytes) -> bytes:
         """Return the bytes of a serialised message that hold its frame id and number of rows.
 
         They begin at the byte offset `SHAPE_AT`. Messages of the same length that agree in these

@@ -116,7 +116,7 @@ def read_skin_elastomer(info: SkinInfo) -> Elastomer | None:
     return Elastomer(*numbers)
 
 
-def geometry(info: SkinInfo) -> list[object]:
+def describe_geometry(info: SkinInfo) -> list[object]:
     """Return the parts of a SkinInfo message that describe the geometry of the skin.
 
     They are the coordinate frame, the elastomer, and the name, pose and half side of each cube. If

@@ -21,7 +21,7 @@ from ..core.latest_stress import STALE_S, LatestStress
 from ..core.poses import CubePoses
 from ..core.rows import StressRows
 from ..messages.codec import stress_codec
-from ..messages.skin_info import geometry, read_cube_poses
+from ..messages.skin_info import describe_geometry, read_cube_poses
 from ..msg import SkinInfo, SkinStress
 from .callbacks import CallbackErrors
 from .messages import CheckedSubscription, log_refused_message
@@ -103,7 +103,7 @@ class SkinSubscriber:
     def _receive_info(self, info: SkinInfo) -> None:
         # After a tare the new `info` differs from the old one only in the rest frequencies. Then
         # the names and poses have not changed, and `on_skin` is not called.
-        if self.skin is not None and geometry(self.skin.info) == geometry(info):
+        if self.skin is not None and describe_geometry(self.skin.info) == describe_geometry(info):
             self.skin.info = info
             return
         try:

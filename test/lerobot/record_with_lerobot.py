@@ -19,7 +19,7 @@ from lerobot.scripts.lerobot_record import record_loop
 from lerobot.teleoperators import Teleoperator
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from cube_tensor_driver.lerobot.live import frame_number
+from cube_tensor_driver.lerobot.live import read_frame_number
 
 FPS = 30
 folder = Path(sys.argv[1])
@@ -58,7 +58,7 @@ class Robot:
             time.sleep(0.2)
         self.read_ns.append(time.time_ns())
         picture = self.cameras["skin"].read_latest()
-        self.numbers.append(frame_number(picture))
+        self.numbers.append(read_frame_number(picture))
         return {"a.pos": 0.0, "skin": picture, "front": np.zeros((240, 320, 3), np.uint8)}
 
     def send_action(self, action):
@@ -98,5 +98,5 @@ with camera:
 data.save_episode()
 data.finalize()
 read = LeRobotDataset("local/live", root=folder / "set")
-found = [frame_number(read[k]["observation.images.skin"]) for k in range(len(read))]
+found = [read_frame_number(read[k]["observation.images.skin"]) for k in range(len(read))]
 print(json.dumps({"read_ns": robot.read_ns, "numbers given": robot.numbers, "numbers": found}))

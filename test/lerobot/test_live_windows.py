@@ -28,7 +28,7 @@ from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import Skin, read_skin
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows, concatenate
 from cube_tensor_driver.lerobot import live as live_module
-from cube_tensor_driver.lerobot.live import LiveWindows, RecordedWindows, frame_number
+from cube_tensor_driver.lerobot.live import LiveWindows, RecordedWindows, read_frame_number
 from cube_tensor_driver.lerobot.windows import TACTILE, WINDOW_COLUMNS
 from cube_tensor_driver.simulation.background import BackgroundHubs
 
@@ -93,10 +93,10 @@ def test_windows_hold_the_bits_of_the_stress_and_a_pause_lengthens_one(tmp_path)
     scans, pictures, first = [1, 2, 60, 3], [], 0
     for number in scans:
         source.give(rows.select(slice(first * cubes, (first + number) * cubes)))
-        pictures.append(live.next_picture(10.0))
+        pictures.append(live.take_next_picture(10.0))
         first += number
     with pytest.raises(TimeoutError, match="no sample in 0"):
-        live.next_picture(0.0)
+        live.take_next_picture(0.0)
     live.close()
 
     expected = ctd.Reconstructor(skin)(rows.select(slice(0, first * cubes)))
@@ -116,7 +116,7 @@ def test_windows_hold_the_bits_of_the_stress_and_a_pause_lengthens_one(tmp_path)
         np.testing.assert_array_equal(window[f"{TACTILE}.count"], [number] * cubes)
     # The same from a picture as LeRobot returns it.
     shown = pictures[2].transpose(2, 0, 1) / np.float32(255)
-    assert frame_number(shown) == frame_number(pictures[2])
+    assert read_frame_number(shown) == read_frame_number(pictures[2])
     assert_picture_shows(pictures[-1], expected.select(slice(-cubes, None)))
 
 
@@ -132,8 +132,8 @@ def test_live_windows_have_the_bits_of_the_export_of_the_same_run(tmp_path):
     windows = []
     for begin, end in pairwise((0, 5, 30, 60)):
         source.give(rows.select(slice(begin * cubes, end * cubes)))
-        picture = live.next_picture(10.0)
-        windows.append(frame_number(picture))
+        picture = live.take_next_picture(10.0)
+        windows.append(read_frame_number(picture))
     live.close()
     touch = RecordedWindows(tmp_path / "touch")
 
@@ -173,7 +173,7 @@ def test_a_frame_has_what_arrived_while_the_recorder_computed(tmp_path, monkeypa
     sys.setswitchinterval(100)
     try:
         arrival.release()
-        picture = live.next_picture(10.0)
+        picture = live.take_next_picture(10.0)
     finally:
         sys.setswitchinterval(interval)
     thread.join(10)
@@ -199,11 +199,11 @@ def test_a_frame_waits_for_samples_that_are_older_than_5_ms_only(tmp_path, monke
     give(50_000_000)
     thread = threading.Timer(0.1, give, [-10_000_000_000])
     thread.start()
-    pictures = [live.next_picture(20.0)]
+    pictures = [live.take_next_picture(20.0)]
     thread.join()
     give(-10_000_000_000)
     begin = time.monotonic()
-    pictures.append(live.next_picture(20.0))
+    pictures.append(live.take_next_picture(20.0))
     assert time.monotonic() - begin < 9
     live.close()
     recorded = RecordedWindows(tmp_path / "touch")

@@ -109,7 +109,7 @@ def test_several_messages_are_decoded_and_encoded_together(kind):
     each = [rows_of(kind, 5) for _ in range(3)]
     data = [by_rosbags(kind, rows, "skin") for rows in each]
     read = codec.decode(joined(*data))
-    assert len(read) == 3 and read.by_message(read.rows.cube).shape == (3, 5)
+    assert len(read) == 3 and read.group_by_message(read.rows.cube).shape == (3, 5)
     for k, rows in enumerate(each):
         assert_equal(read.rows.select(slice(5 * k, 5 * k + 5)), rows)
     assert codec.encode(read.rows, read.stamp_ns, read.frame_id) == data

@@ -178,7 +178,7 @@ class TopicLog(Generic[AnyRows]):
     def _find_batch(self, item: tuple[int, Message]) -> tuple[int, int, bytes]:
         """Return what successive messages that are decoded together have in common."""
         number, message = item
-        shape = self._codec.shape_bytes(message.data)
+        shape = self._codec.read_shape_bytes(message.data)
         return number // MESSAGES_PER_DECODING, len(message.data), shape
 
 

@@ -14,7 +14,7 @@ from ...core.rows import FrequencyRows, StressRows
 from ...messages.codec import Decoded
 from ...messages.contacts import make_contacts_message, make_traction_message
 from ...messages.skin_info import (
-    geometry,
+    describe_geometry,
     read_cube_calibrations,
     read_cube_poses,
     read_skin_elastomer,
@@ -111,7 +111,7 @@ class ContactWriter:
             read_skin_elastomer(info),
         )
         self._latest = LatestStress(len(info.cubes))
-        self._geometry = geometry(info)
+        self._geometry = describe_geometry(info)
         self._frame_id = info.header.frame_id
 
     def write(
