@@ -63,7 +63,7 @@ def add_arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Compute a cube's response matrix by finite elements."""
     from cube_tensor_driver.config.output_files import write_json
-    from cube_tensor_driver.views.terminal.output import progress_bar
+    from cube_tensor_driver.views.terminal.output import show_progress_bar
 
     from .. import reports
     from ..fem.fem import compute_response
@@ -82,7 +82,7 @@ def run(options: argparse.Namespace) -> int:
     print(f"{cube}{place}; {layout.n_pads} pads{symmetry}", flush=True)
     result: reports.Result
     # The factorisation runs in C, where Ctrl-C would not be noticed.
-    with ends_at_once(), progress_bar() as report:
+    with ends_at_once(), show_progress_bar() as report:
         if options.load == "surface":
             result = study_surface(body, layout, meshes, model.neglect, report)
         elif options.load == "temperature":

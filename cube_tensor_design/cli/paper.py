@@ -22,11 +22,11 @@ def add_arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Repeat the source paper's experiments on a virtual bench."""
-    from cube_tensor_driver.views.terminal.output import progress_bar
+    from cube_tensor_driver.views.terminal.output import show_progress_bar
 
     from ..figures.paper import save_paper
 
-    with progress_bar() as report:
+    with show_progress_bar() as report:
         written = save_paper(options.out, report)
     names = ", ".join(path.name for path in written)
     print(f"wrote {names} into {options.out}")

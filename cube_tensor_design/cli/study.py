@@ -25,13 +25,13 @@ def run(options: argparse.Namespace) -> int:
     """Find how wide a contact must be for each layout to be right."""
     from cube_tensor_driver.config.output_files import write_json
     from cube_tensor_driver.views.figures.style import save
-    from cube_tensor_driver.views.terminal.output import progress_bar
+    from cube_tensor_driver.views.terminal.output import show_progress_bar
 
     from ..figures.trust import draw_trust
     from ..reports import show_study
     from ..studies.layout_study import study_layouts
 
-    with progress_bar() as report:
+    with show_progress_bar() as report:
         result = study_layouts(progress=report)
     show_study(result)
     save(draw_trust(result), options.figure)

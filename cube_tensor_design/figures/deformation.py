@@ -12,7 +12,7 @@ from matplotlib.tri import LinearTriInterpolator, Triangulation
 
 from cube_tensor_driver.core.arrays import Array, Mask
 from cube_tensor_driver.core.layout import Layout
-from cube_tensor_driver.views.figures.style import SIGNED_COLOURS, print_style, symbol
+from cube_tensor_driver.views.figures.style import SIGNED_COLOURS, format_symbol, print_style
 
 from ..paper.virtual_bench import Deformation
 
@@ -73,7 +73,7 @@ def draw_loads(layout: Layout, deformations: dict[str, Deformation]) -> Figure:
     axes = figure.subplots(4, 2)
     for axis, (name, deformation) in zip(axes.flat, deformations.items(), strict=False):
         scale = _draw_deformation(axis, deformation, LOADS_WINDOW)
-        axis.set_title(f"{symbol(name)}, 10 kPa (displacements times {scale:.2g})")
+        axis.set_title(f"{format_symbol(name)}, 10 kPa (displacements times {scale:.2g})")
         _draw_pads(axis, layout, 1e3 * deformation.half_side)
     pad = Patch(color="tab:red", label="pad")
     axes.flat[-1].axis("off")

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cube_tensor_driver.core.modes import PLANE
-from cube_tensor_driver.views.figures.style import print_style, symbol
+from cube_tensor_driver.views.figures.style import format_symbol, print_style
 
 from ..paper.experiments import ON_LOWER, Experiment, compute_foam_frequency
 from ..paper.rod_parts import RodParts
@@ -87,7 +87,7 @@ def _draw_modes(axis: Axes, result: Experiment, modes: slice) -> None:
     """Draw recovered and true amplitudes of some modes (linear stress fields) of the plane."""
     recovered = result.recovered[:, modes]
     truth = result.truth[:, modes]
-    labels = [symbol(name) for name in PLANE.names[modes]]
+    labels = [format_symbol(name) for name in PLANE.names[modes]]
     # matplotlib puts no label with an underscore into the legend.
     hidden = [f"_{label}" for label in labels]
     x = result.displacement

@@ -13,8 +13,8 @@ from cube_tensor_driver.mechanics.influence import Influence
 from cube_tensor_driver.views.figures.style import (
     SIGNED_COLOURS,
     choose_curve_style,
+    format_symbol,
     print_style,
-    symbol,
 )
 
 from ..fem.fem import Response
@@ -74,7 +74,7 @@ def draw_response(result: Response) -> Figure:
     image = axis.imshow(result.matrix, cmap=SIGNED_COLOURS, aspect="auto")
     image.set_clim(-limit, limit)
     axis.grid(False)
-    labels = [symbol(mode) for mode in result.modes]
+    labels = [format_symbol(mode) for mode in result.modes]
     axis.set_xticks(range(n_modes), labels, rotation=60 if n_modes > 7 else 0)
     pads = [f"V{k}  {pad}" for k, pad in enumerate(result.layout.pads, 1)]
     axis.set_yticks(range(n_pads), pads)

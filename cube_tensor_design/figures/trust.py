@@ -13,8 +13,8 @@ from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.modes import COMPONENTS, STRESS
 from cube_tensor_driver.views.figures.style import (
     choose_curve_style,
+    format_symbol,
     print_style,
-    symbol,
 )
 
 from ..studies.layout_study import DEPTH, MAX_TRUSTED_ERROR, LayoutStudy
@@ -72,7 +72,7 @@ def _draw_errors(axis: Axes, widths: Array, errors: Array) -> None:
     for number, component in enumerate(COMPONENTS):
         is_observed = not np.isnan(errors[0, number])
         if is_observed:
-            (curve,) = axis.loglog(widths, errors[:, number], label=symbol(component))
+            (curve,) = axis.loglog(widths, errors[:, number], label=format_symbol(component))
             curve.set(**_choose_component_style(number))
 
 

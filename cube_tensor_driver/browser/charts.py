@@ -16,7 +16,7 @@ from viser import uplot
 from ..core.arrays import Array
 from ..core.modes import COMPONENTS, STRESS
 from ..views.figures.panels import draw_panels
-from ..views.figures.style import png
+from ..views.figures.style import render_png
 from ..views.round_numbers import round_range
 from ..views.scene import find_component_unit
 from . import markup
@@ -191,7 +191,7 @@ class Charts:
             return
         if kind == "PNG":
             panels = [(chart.axis, chart.values(history)) for chart in self._charts]
-            content = png(draw_panels(history.times, TIME_LABEL, panels))
+            content = render_png(draw_panels(history.times, TIME_LABEL, panels))
         else:
             content = format_csv(history, self._cubes, self._names)
         client.send_file_download(

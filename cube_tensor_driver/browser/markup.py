@@ -213,7 +213,7 @@ def legend(
     if quantity is DEVIATION and field.sigma is None:
         return box(NO_DEVIATION)
     values = np.linspace(-top if quantity.signed else 0, top, LEGEND_STEPS)
-    fractions = scene.colours(quantity, values, top)
+    fractions = scene.choose_colours(quantity, values, top)
     colours = (255 * fractions).astype(int).tolist()
     stops = ",".join(f"rgb({red},{green},{blue})" for red, green, blue in colours)
     middle = (LEGEND_STEPS - 1) // 2

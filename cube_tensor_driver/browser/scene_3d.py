@@ -359,7 +359,9 @@ class Scene:
         values, visible = colouring.field, np.full(len(colouring.field), with_field)
         update: Update = {}
         if self._is_solid:
-            colours = scene.convert_to_linear_light(scene.colours(quantity, colouring.cubes, top))
+            colours = scene.convert_to_linear_light(
+                scene.choose_colours(quantity, colouring.cubes, top)
+            )
             update["cubes"] = {"batched_colors": colours}
         else:
             values = np.append(values, colouring.cubes)
@@ -400,7 +402,7 @@ class Scene:
         size = np.linalg.norm(vectors, axis=1)
         arrows = arrows[size > MIN_ARROW * self._placement.arrow]
         directions = np.broadcast_to(VIEW_DIRECTION, (len(arrows), 3))
-        return scene.heads(arrows, directions)
+        return scene.make_arrow_lines(arrows, directions)
 
     def _draw_crosses(self, values: Array, longest: float) -> dict[str, Array]:
         """Return the lines of the principal stresses: a cross of three lines above each cube.
@@ -431,7 +433,7 @@ class Scene:
         half_side = float(placement.poses.half_side[cube])
         side = max(2.6 * half_side, 0.2 * placement.arrow)
         lines = make_corner_lines(placement.poses.rotation[cube], side)
-        return np.asarray(lines + scene.above(placement.poses, 1.1)[cube])
+        return np.asarray(lines + scene.compute_points_above(placement.poses, 1.1)[cube])
 
     def _draw_contacts(self, contacts: Sequence[Contact]) -> Array:
         """Return the lines of a ring around each contact; the ring encloses the contact's area."""
@@ -443,7 +445,7 @@ class Scene:
             # The ring lies in the plane of the drawn field, so that it encloses the load there.
             centre = placement.point(contact.position) - self._contact_depth * contact.normal
             rings.append(
-                scene.ring(
+                scene.make_ring(
                     centre,
                     contact.normal,
                     radius,
@@ -565,7 +567,7 @@ def _make_squares(
     rotation = poses.rotation[of_cube]
     side = np.full(len(points), surface.spacing * placement.unit)
     if with_cubes:
-        points = np.concatenate([points, scene.above(poses, 1.0)])
+        points = np.concatenate([points, scene.compute_points_above(poses, 1.0)])
         rotation = np.concatenate([rotation, poses.rotation])
         side = np.append(side, 2 * poses.half_side)
     return compute_square_corners(points, rotation, side)

@@ -122,7 +122,7 @@ def show_skin(bag: Bag, topic: str) -> None:
     from ..bags.recording import find_skin_infos
     from ..bags.summary import summarise_cubes
     from ..core.errors import BagError
-    from ..views.terminal.output import counted, print_table, say
+    from ..views.terminal.output import format_count, print_table, say
 
     try:
         info = find_skin_infos(bag, topic)[-1]
@@ -131,14 +131,14 @@ def show_skin(bag: Bag, topic: str) -> None:
         say(str(error), "red")
         return
     frame, version = info.header.frame_id, info.version
-    cubes = counted(len(info.cubes), "cube")
+    cubes = format_count(len(info.cubes), "cube")
     say(f"skin {info.name!r}: {cubes} in {frame}, info version {version}")
     counts = Counter(cube.calibration_id for cube in info.cubes)
     for name, count in counts.items():
         # One calibration has one layout. A bag with several, which is damaged, shows all of them.
         layouts = {cube.layout for cube in info.cubes if cube.calibration_id == name}
         layout = ", ".join(sorted(layouts))
-        cubes = counted(count, "cube")
+        cubes = format_count(count, "cube")
         say(f"  calibration {name}, layout {layout}: {cubes}")
 
     rows = []

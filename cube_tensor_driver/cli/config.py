@@ -89,7 +89,7 @@ def write_grid(options: argparse.Namespace) -> int:
     from ..config.skin import check_skin_data
     from ..config.yaml import write_yaml
     from ..core.errors import ConfigError
-    from ..views.terminal.output import counted, working
+    from ..views.terminal.output import format_count, show_working
 
     # Each option has the name of the argument of `describe_grid` that it sets.
     names = "name", "nx", "ny", "pitch", "links", "calibration", "layout", "rate", "port"
@@ -101,8 +101,8 @@ def write_grid(options: argparse.Namespace) -> int:
         raise ConfigError(f"grid: {mistakes[0]}")
     size = f"{options.nx} x {options.ny} cubes, {1e3 * options.pitch:g} mm apart"
     # This text is printed and also becomes the header of the file.
-    text = f"{size}, on {counted(options.links, 'link')}"
-    with working(f"writing {len(skin['cubes'])} cubes"):
+    text = f"{size}, on {format_count(options.links, 'link')}"
+    with show_working(f"writing {len(skin['cubes'])} cubes"):
         write_yaml(options.output, skin, f"{text}. docs/config.md describes the keys.")
     print(f"wrote {options.output}: {text}")
     return 0
@@ -117,10 +117,10 @@ def check_file(path: Path) -> int:
     from ..config.pose_check import find_pose_doubts
     from ..config.skin import check_skin
     from ..device.links.line_load import find_slow_lines
-    from ..views.terminal.output import counted, working
+    from ..views.terminal.output import format_count, show_working
 
     # `working` shows that the command is busy, because a skin of thousands of cubes takes seconds.
-    with working(f"checking {path}"):
+    with show_working(f"checking {path}"):
         skin, mistakes = check_skin(path)
         # Implausible poses, and serial lines that are too slow for the sampling rate, can only be
         # found if the file describes a valid skin.
@@ -133,8 +133,8 @@ def check_file(path: Path) -> int:
     # The cubes are counted by layout, because a skin may have cubes of several layouts.
     layouts = Counter(cube.calibration.layout.name for cube in skin.cubes)
     by_layout = ", ".join(f"{number} {name}" for name, number in layouts.items())
-    cubes = f"{counted(len(skin.cubes), 'cube')} ({by_layout})"
+    cubes = f"{format_count(len(skin.cubes), 'cube')} ({by_layout})"
     rate = "the rate of the hubs" if skin.rate is None else f"{skin.rate:g} Hz"
-    links = counted(len(skin.links), "link")
+    links = format_count(len(skin.links), "link")
     print(f"{path}: skin {skin.name!r}: {cubes}, {links}, {rate}: nothing wrong")
     return 0

@@ -98,7 +98,7 @@ def run(options: argparse.Namespace) -> int:
     from ..bags.reprocess.all_bags import RECIPE_NAME
     from ..lerobot.export import check_empty, export_lerobot
     from ..lerobot.plan import Choices
-    from ..views.terminal.output import progress_bar
+    from ..views.terminal.output import show_progress_bar
 
     if options.what in TABLES:
         # A folder that contains the file RECIPE_NAME belongs to an export that was interrupted and
@@ -112,7 +112,7 @@ def run(options: argparse.Namespace) -> int:
     options.overrides = reprocess.read_overrides(options)
     names = [field.name for field in fields(Choices)]
     choices = Choices(**{name: getattr(options, name) for name in names})
-    with progress_bar() as report:
+    with show_progress_bar() as report:
         exported = export_lerobot(
             options.bags,
             options.output,

@@ -88,7 +88,7 @@ def run(options: argparse.Namespace) -> int:
         write_recipe,
     )
     from ..core.errors import CubeError
-    from ..views.terminal.output import progress_bar
+    from ..views.terminal.output import show_progress_bar
 
     overrides, contacts = read_overrides(options), read_contact_options(options)
     jobs = make_jobs(
@@ -108,7 +108,7 @@ def run(options: argparse.Namespace) -> int:
 
     failed = 0
     try:
-        with start_workers(options.jobs, len(waiting)) as executor, progress_bar() as report:
+        with start_workers(options.jobs, len(waiting)) as executor, show_progress_bar() as report:
             results = reprocess_all(waiting, executor)
             for done, (job, result) in enumerate(results, 1):
                 report(done, len(waiting), "reprocessing")

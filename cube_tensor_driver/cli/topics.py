@@ -38,9 +38,9 @@ def describe_cubes(cubes: list[str]) -> str:
         cubes: Names of the cubes. For a topic of the whole skin the list is empty, and the function
             returns an empty text.
     """
-    from ..views.terminal.output import counted
+    from ..views.terminal.output import format_count
 
     if not cubes:
         return ""
     names = ", ".join(cubes) if len(cubes) < 3 else f"{cubes[0]} … {cubes[-1]}"
-    return f", {counted(len(cubes), 'cube')}: {names}"
+    return f", {format_count(len(cubes), 'cube')}: {names}"

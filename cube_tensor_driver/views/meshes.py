@@ -148,7 +148,7 @@ def paint_squares(
         top: Value at the upper end of the colour scale, in SI units.
         visible: (M,) whether each square is drawn.
     """
-    steps = colour_steps(quantity, values, top)
+    steps = find_colour_steps(quantity, values, top)
     meshes = []
     for step in range(COLOUR_STEPS + 1):
         chosen = np.flatnonzero(visible & (steps == step))
@@ -156,7 +156,7 @@ def paint_squares(
     return meshes
 
 
-def colour_steps(
+def find_colour_steps(
     quantity: Quantity,
     values: Array,
     top: float,
@@ -182,5 +182,5 @@ def step_colours(quantity: Quantity) -> NDArray[np.uint8]:
     if quantity.signed:
         values = 2 * values - 1
     with_unknown = np.append(values, np.nan)
-    colours = scene.colours(quantity, with_unknown, 1.0)
+    colours = scene.choose_colours(quantity, with_unknown, 1.0)
     return np.round(255 * colours).astype(np.uint8)

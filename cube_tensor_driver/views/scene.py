@@ -23,19 +23,19 @@ from ..core.poses import CubePoses
 from ..core.tensor import TRACTION_COMPONENTS, principal_stresses
 
 
-def _colour_table(hexes: str) -> Array:
+def _make_colour_table(hexes: str) -> Array:
     colours = [tuple(bytes.fromhex(text)) for text in hexes.split()]
     return np.array(colours) / 255
 
 
-SEQUENTIAL = _colour_table("ffffcc ffeda0 fed976 feb24c fd8d3c fc4e2a e31a1c bd0026 800026")
+SEQUENTIAL = _make_colour_table("ffffcc ffeda0 fed976 feb24c fd8d3c fc4e2a e31a1c bd0026 800026")
 """Colour scale (9, 3) of values that are never negative, from 0 to 1 (YlOrRd of ColorBrewer).
 
 It is light at zero, so that a skin at rest is visible, and its lightness falls monotonically, so
 that it can be read in grey.
 """
 
-DIVERGING = _colour_table("053061 2a71b2 6bacd1 c2ddec f7f6f6 fbccb4 e48066 ba2832 67001f")
+DIVERGING = _make_colour_table("053061 2a71b2 6bacd1 c2ddec f7f6f6 fbccb4 e48066 ba2832 67001f")
 """Colour scale (9, 3) of values on both sides of zero, from 0 to 1 (RdBu of ColorBrewer, reversed).
 
 It is light at zero and becomes darker on both sides: blue for negative, red for positive values.
@@ -102,7 +102,7 @@ def _component(name: str) -> Callable[[Array, Array], Array]:
     return lambda values, residual: values[:, column]
 
 
-def _magnitude(*names: str) -> Callable[[Array, Array], Array]:
+def _make_magnitude(*names: str) -> Callable[[Array, Array], Array]:
     """Return a function for `Quantity.of`: the magnitude of the vector of some components.
 
     Args:
@@ -138,14 +138,14 @@ def _stress(
 
 QUANTITIES = {
     "pressure": _stress("pressure −σzz", lambda values, residual: -values[:, 2]),
-    "shear": _stress("shear |σzx, σyz|", _magnitude("zx", "yz")),
+    "shear": _stress("shear |σzx, σyz|", _make_magnitude("zx", "yz")),
     "gradient": Quantity(
         "gradient |∂σzz/∂x, ∂σzz/∂y|",
         unit="kPa/mm",
         size=1e6,
         min_top=1e5,
         signed=False,
-        of=_magnitude("zz_x", "zz_y"),
+        of=_make_magnitude("zz_x", "zz_y"),
     ),
     **{
         name: _stress(
@@ -216,7 +216,7 @@ class Ranges(NamedTuple):
         gradient: Gradient of the pressure, in Pa/m, that the longest arrow shows.
     """
 
-    colours: float = 0.0
+    choose_colours: float = 0.0
     traction: float = 0.0
     gradient: float = 0.0
 
@@ -246,7 +246,7 @@ class Ranges(NamedTuple):
         return Ranges(colours, traction, longest_gradient)
 
 
-def colours(
+def choose_colours(
     quantity: Quantity,
     values: Array,
     top: float,
@@ -282,7 +282,7 @@ def convert_to_linear_light(colours: Array) -> NDArray[np.uint8]:
     return (255 * linear).astype(np.uint8)
 
 
-def above(poses: CubePoses, factor: float) -> Array:
+def compute_points_above(poses: CubePoses, factor: float) -> Array:
     """Return one point above the centre of each cube (N, 3), along its z axis.
 
     Args:
@@ -317,7 +317,7 @@ def make_traction_arrows(
     traction = np.nan_to_num(values[:, TRACTION_COMPONENTS])
     in_cube = traction * length
     arrow = np.einsum("nij,nj->ni", poses.rotation, in_cube)
-    face = above(poses, 1.0)
+    face = compute_points_above(poses, 1.0)
     presses = in_cube[:, 2:] < 0
     tail = np.where(presses, face - arrow, face)
     return np.stack([tail, tail + arrow], axis=1)
@@ -377,7 +377,7 @@ def make_principal_crosses(
     in_parent = np.einsum("nij,nkj->nki", poses.rotation, directions)
     half_length = 0.5 * length * np.abs(principal)
     half = in_parent * half_length[..., None]
-    centre = above(poses, 1.0)[:, None]
+    centre = compute_points_above(poses, 1.0)[:, None]
     lines = np.stack([centre - half, centre + half], axis=2)
     return lines, np.asarray(principal > 0)
 
@@ -406,7 +406,7 @@ def make_fault_crosses(poses: CubePoses, health: AnyArray) -> Array:
     return np.asarray(centre[:, None, None] + in_parent)
 
 
-def heads(arrows: Array, normal: Array) -> Array:
+def make_arrow_lines(arrows: Array, normal: Array) -> Array:
     """Return three lines per arrow, shaft and two barbs, for viewers that can only draw lines.
 
     Args:
@@ -431,7 +431,7 @@ def heads(arrows: Array, normal: Array) -> Array:
     return np.stack([arrows, *barbs], axis=1)
 
 
-def ring(
+def make_ring(
     centre: Array,
     normal: Array,
     radius: float,

@@ -34,12 +34,12 @@ def add_arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Return 1 if the hub breaks a rule, else 0."""
     from cube_tensor_driver.config.output_files import write_json
-    from cube_tensor_driver.views.terminal.output import progress_bar
+    from cube_tensor_driver.views.terminal.output import show_progress_bar
 
     from ..check import check
     from ..port_wire import PortWire
 
-    with PortWire(options.port, options.baud) as wire, progress_bar() as report:
+    with PortWire(options.port, options.baud) as wire, show_progress_bar() as report:
         checked = check(wire, report)
     show_check(checked)
     if options.json is not None:

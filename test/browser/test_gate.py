@@ -29,7 +29,7 @@ from cube_tensor_driver.browser.history import History
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.modes import COMPONENTS
 from cube_tensor_driver.views.figures.panels import draw_panels
-from cube_tensor_driver.views.figures.style import png
+from cube_tensor_driver.views.figures.style import render_png
 from cube_tensor_driver.views.round_numbers import round_range
 from cube_tensor_driver.views.scene import QUANTITIES
 
@@ -184,7 +184,7 @@ def test_saved_tables_and_pictures_hold_what_the_cubes_showed() -> None:
     (axis,) = (figure := draw_panels(history.times, "time before now / s", panels)).axes
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("time before now / s", "normal stress / kPa")
     np.testing.assert_allclose(axis.lines[0].get_xydata(), [[-1, -2], [-0.5, -3], [0, -4]])
-    with Image.open(io.BytesIO(png(figure))) as picture:
+    with Image.open(io.BytesIO(render_png(figure))) as picture:
         assert picture.format == "PNG" and min(picture.size) > 400
 
 

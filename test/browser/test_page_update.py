@@ -243,7 +243,7 @@ def test_all_that_a_browser_receives_at_once_is_of_one_scan(page, ros):
         assert np.ptp(state.ring) > 0
         assert state.surface == pytest.approx(-state.zz, abs=5.1)
         assert state.top == pytest.approx(TOP_PA)
-        colour = scene.colours(scene.QUANTITIES["pressure"], np.array([-state.zz]), TOP_PA)
+        colour = scene.choose_colours(scene.QUANTITIES["pressure"], np.array([-state.zz]), TOP_PA)
         assert state.colour == scene.convert_to_linear_light(colour)[0].tolist()
     # viser applies at most 128 messages at once.
     assert max(page.reader.windows) < 128

@@ -19,7 +19,7 @@ import pytest
 from conftest import ROOT
 from cube_tensor_driver.config.rviz import make_rviz_view
 from cube_tensor_driver.config.skin import read_skin
-from cube_tensor_driver.views.scene import QUANTITIES, colours
+from cube_tensor_driver.views.scene import QUANTITIES, choose_colours
 
 yaml = pytest.importorskip("yaml")
 
@@ -229,7 +229,7 @@ def test_cubes_at_rest_and_arrows_stand_out_from_the_ground_of_rviz():
     rviz = yaml.safe_load((ROOT / "rviz" / "skin.rviz").read_text())
     ground = rviz["Visualization Manager"]["Global Options"]["Background Color"]
     grey = np.array([float(part) for part in ground.split(";")]) / 255
-    at_rest = colours(QUANTITIES["pressure"], np.zeros(1), 1.0)[0]
+    at_rest = choose_colours(QUANTITIES["pressure"], np.zeros(1), 1.0)[0]
     for colour in (at_rest, np.ones(3)):
         assert abs((colour - grey) @ [0.299, 0.587, 0.114]) > 0.2
 

@@ -40,7 +40,7 @@ from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.mechanics.influence import read_influence
-from cube_tensor_driver.views.terminal.output import progress_bar
+from cube_tensor_driver.views.terminal.output import show_progress_bar
 
 NARROW = bodies.Body(width=20e-3)
 SMALL = "body: {width: 0.02, height: 0.012}\n"
@@ -525,7 +525,7 @@ def test_study_says_where_to_trust(monkeypatch, tmp_path, capsys):
 
 def test_a_file_gets_no_progress_bar(capsys):
     """Not even an empty line: errors follow on stderr."""
-    with progress_bar() as report:
+    with show_progress_bar() as report:
         report(1, 2, "half of it")
     assert capsys.readouterr() == ("", "")
 

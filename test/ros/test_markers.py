@@ -65,12 +65,16 @@ def test_principal_cross_of_pure_shear_lies_at_45_degrees():
 
 def test_colours_are_the_table_s_ends_grey_where_unknown_and_monotonous_in_lightness():
     quantity = QUANTITIES["pressure"]
-    shown = scene.colours(quantity, np.array([-5.0, 0, 10, 99, np.nan]), 10.0)
+    shown = scene.choose_colours(quantity, np.array([-5.0, 0, 10, 99, np.nan]), 10.0)
     zero, top = np.array([0xFF, 0xFF, 0xCC]) / 255, np.array([0x80, 0x00, 0x26]) / 255
     np.testing.assert_allclose(shown, [zero, zero, top, top, scene.GREY])
-    lightness = scene.colours(quantity, np.linspace(0, 10, 50), 10.0) @ [0.299, 0.587, 0.114]
+    lightness = scene.choose_colours(quantity, np.linspace(0, 10, 50), 10.0) @ [0.299, 0.587, 0.114]
     assert (np.diff(lightness) < 0).all()
-    signed = scene.colours(QUANTITIES["zz"], np.array([-10.0, 0, 10]), 10.0) @ [0.299, 0.587, 0.114]
+    signed = scene.choose_colours(QUANTITIES["zz"], np.array([-10.0, 0, 10]), 10.0) @ [
+        0.299,
+        0.587,
+        0.114,
+    ]
     assert signed[1] > 2 * max(signed[0], signed[2])
 
 
@@ -364,7 +368,7 @@ def test_the_head_of_an_arrow_is_at_its_tip_and_flat_to_the_viewer():
     arrows = np.random.default_rng(3).normal(size=(7, 2, 3))
     normal = np.array([0.6, 0.0, 0.8])
     arrows[0, 1] = arrows[0, 0] + 2 * normal
-    lines = scene.heads(arrows, np.broadcast_to(normal, (7, 3)))
+    lines = scene.make_arrow_lines(arrows, np.broadcast_to(normal, (7, 3)))
     np.testing.assert_array_equal(lines[:, 0], arrows)
     tip, along = arrows[:, 1], arrows[:, 1] - arrows[:, 0]
     np.testing.assert_array_equal(lines[:, 1:, 0], np.stack([tip, tip], axis=1))

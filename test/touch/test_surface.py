@@ -154,15 +154,15 @@ def test_what_no_surface_is(depth, side):
 
 def test_the_view_s_squares_have_the_colour_of_their_value():
     from cube_tensor_driver.views import scene
-    from cube_tensor_driver.views.meshes import COLOUR_STEPS, colour_steps, step_colours
+    from cube_tensor_driver.views.meshes import COLOUR_STEPS, find_colour_steps, step_colours
 
     for name in ("pressure", "zz"):
         quantity = scene.QUANTITIES[name]
         shown = np.append(np.linspace(-12e3, 12e3, 301), np.nan)
-        colours = step_colours(quantity)[colour_steps(quantity, shown, 10e3)]
-        expected = 255 * scene.colours(quantity, shown, 10e3)
+        colours = step_colours(quantity)[find_colour_steps(quantity, shown, 10e3)]
+        expected = 255 * scene.choose_colours(quantity, shown, 10e3)
         # half a step, where the scale is steepest
-        scale = 255 * scene.colours(quantity, np.linspace(-10e3, 10e3, 2000), 10e3)
+        scale = 255 * scene.choose_colours(quantity, np.linspace(-10e3, 10e3, 2000), 10e3)
         steepest = np.abs(np.diff(scale, axis=0)).max() * 2000 / COLOUR_STEPS
         assert np.abs(colours - expected).max() <= steepest / 2 + 1
 

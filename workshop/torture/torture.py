@@ -19,7 +19,7 @@ from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.demo.running import Interrupted
 from cube_tensor_driver.processes.domain import own_domain
 from cube_tensor_driver.processes.stop_signals import stop_event
-from cube_tensor_driver.views.terminal.output import progress_bar
+from cube_tensor_driver.views.terminal.output import show_progress_bar
 
 from ..checks.all_checks import check_all
 from ..report import report
@@ -120,7 +120,7 @@ def run_mutations(
     # error `result` raises here.
     interrupted = stop_event()
     results: dict[str, dict[str, Any]] = {}
-    with progress_bar() as progress:
+    with show_progress_bar() as progress:
         for number, name in enumerate(names):
             if interrupted.is_set():
                 raise Interrupted("interrupted")

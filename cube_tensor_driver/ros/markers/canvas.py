@@ -125,7 +125,7 @@ class Canvas:
                 `LatestStress.health` returns it.
             contacts: The newest message of contacts; None: no contact is drawn.
         """
-        colours = scene.colours(quantity, shown, ranges.colours)
+        colours = scene.choose_colours(quantity, shown, ranges.colours)
         shapes = [shape._replace(colours=colours[members]) for members, shape in self._plates]
         shapes += self._draw_arrows(values, ranges)
         shapes.append(self._draw_faults(health))
@@ -217,7 +217,7 @@ class Canvas:
             # drawn.
             area = max(0.0, contacts.area[number])
             radius = float(np.sqrt(area / np.pi))
-            rings[number] = scene.ring(
+            rings[number] = scene.make_ring(
                 position,
                 normal,
                 radius,
@@ -251,7 +251,7 @@ def _make_plates(poses: CubePoses) -> list[tuple[Index, Shape]]:
         For each group, the indices of its cubes and the shape without colours.
     """
     plates = []
-    centres = scene.above(poses, PLATE_HEIGHT)
+    centres = scene.compute_points_above(poses, PLATE_HEIGHT)
     groups, rotations = _group_by_orientation(poses.rotation)
     oriented = zip(
         groups,

@@ -176,7 +176,7 @@ def draw_arrows(
     """
     return make_lines(
         name,
-        scene.heads(arrows, normal),
+        scene.make_arrow_lines(arrows, normal),
         LINE_WIDTH * pitch,
         scale.colour,
     )
@@ -210,7 +210,7 @@ def draw_legend(
         Marker.CUBE_LIST,
         (place.width / BAR_BOXES, 0.3 * place.pitch, 0.05 * place.pitch),
         boxes * UPSIDE_DOWN,
-        scene.colours(quantity, values, top),
+        scene.choose_colours(quantity, values, top),
         # This quaternion is the rotation `UPSIDE_DOWN`, by 180 degrees about the y axis.
         rotation=(0.0, 1.0, 0.0, 0.0),
     )

@@ -69,7 +69,7 @@ def print_style() -> Iterator[None]:
         yield
 
 
-def symbol(component: str) -> str:
+def format_symbol(component: str) -> str:
     """Return the symbol of a component or mode in matplotlib's notation for mathematics.
 
     Args:
@@ -77,7 +77,7 @@ def symbol(component: str) -> str:
             (difference of two derivatives).
     """
     if "-" in component:
-        return " − ".join(symbol(part) for part in component.split("-"))
+        return " − ".join(format_symbol(part) for part in component.split("-"))
     stress, _, direction = component.partition("_")
     if not direction:
         return rf"$\sigma_{{{stress}}}$"
@@ -121,7 +121,7 @@ def save(figure: Figure, path: Path) -> None:
 
 
 @print_style()
-def png(figure: Figure) -> bytes:
+def render_png(figure: Figure) -> bytes:
     """Return a figure as the content of a PNG file."""
     content = io.BytesIO()
     figure.savefig(content, format="png")

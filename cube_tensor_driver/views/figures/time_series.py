@@ -19,7 +19,7 @@ from ...core.modes import GRADIENT, STRESS
 from ...core.rows import StressRows, concatenate
 from ...core.status import INVALID, RESIDUAL
 from .panels import draw_panels
-from .style import print_style, symbol
+from .style import format_symbol, print_style
 
 MAX_POINTS = 20_000
 """Maximum number of samples of a line that are drawn; more cannot be distinguished on paper."""
@@ -111,12 +111,12 @@ def draw_series(series: TimeSeries, title: str) -> Figure:
     change_percent = 100 * (series.frequency / series.rest - 1)
     rows = series.rows
     stress = zip(
-        map(symbol, STRESS),
+        map(format_symbol, STRESS),
         1e-3 * rows.stress.T,
         strict=True,
     )
     gradient = zip(
-        map(symbol, GRADIENT),
+        map(format_symbol, GRADIENT),
         1e-6 * rows.gradient.T,
         strict=True,
     )

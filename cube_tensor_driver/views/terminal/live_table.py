@@ -22,7 +22,7 @@ from ...core.modes import COMPONENTS
 from ...core.rows import StressRows
 from ...core.status import describe_status
 from ..scene import find_component_unit
-from .output import counted
+from .output import format_count
 
 DRAW_PERIOD_S = 0.1
 """Minimum time, in seconds, from one drawing of the table to the next."""

@@ -37,7 +37,7 @@ def say(
     )
 
 
-def counted(number: int, noun: str) -> str:
+def format_count(number: int, noun: str) -> str:
     """Return a number with its noun, such as "1 cube" or "5 cubes"."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
@@ -95,7 +95,7 @@ def print_table(
 
 
 @contextmanager
-def progress_bar() -> Iterator[Callable[[float, float, str], None]]:
+def show_progress_bar() -> Iterator[Callable[[float, float, str], None]]:
     """Show a progress bar of one line on stderr inside a `with` block, if stderr is a terminal.
 
     Yields:
@@ -145,7 +145,7 @@ def progress_bar() -> Iterator[Callable[[float, float, str], None]]:
         bar.update(task, completed=bar.tasks[0].total)
 
 
-def working(text: str) -> AbstractContextManager[object]:
+def show_working(text: str) -> AbstractContextManager[object]:
     """Show a text with an animation on stderr, if that is a terminal, inside a `with` block.
 
     It is for work whose progress is unknown.
