@@ -470,8 +470,8 @@ void cube_forces(const cube_forces_call *call) {
     }
 }
 
-/* Computes the share m = 1 - exp(-ratio) for a ratio from 0 on, and m / ratio. `relaxed_share` in
- * core/compensation/low_pass.py explains the series. */
+/* Computes the share m = 1 - exp(-ratio) for a ratio from 0 on, and m / ratio.
+ * `compute_relaxed_share` in core/compensation/low_pass.py explains the series. */
 INLINE void relax(double ratio, double *share, double *mean) {
     const double part = (ratio < 64 ? ratio : 64) / 1024;
     double m = 0;

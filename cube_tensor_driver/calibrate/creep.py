@@ -30,12 +30,12 @@ import numpy as np
 from ..bags.source import open_bag
 from ..core.arrays import Array
 from ..core.calibration import Calibration
-from ..core.compensation.low_pass import relaxed_share
+from ..core.compensation.low_pass import compute_relaxed_share
 from ..core.compensation.models import CreepModel
 from ..core.errors import FitError
 from ..messages.codec import SECOND
 from .block_means import find_lags
-from .fit import compute_measured_stress
+from .fit import measured_stress
 from .recorded_loads import average_neighbours, find_cube, read_samples
 
 TIMES_PER_DECADE = 2.0
@@ -182,7 +182,7 @@ def fit_recorded_creep(path: Path, name: str | None) -> tuple[CreepFit, Calibrat
     is_complete = np.isfinite(frequency).all(axis=1)
     stamp_ns = stamp_ns[is_complete]
     known = temperature[is_complete] if np.isfinite(temperature).all() else None
-    reading = compute_measured_stress(current, frequency[is_complete], known)
+    reading = measured_stress(current, frequency[is_complete], known)
     seconds = (stamp_ns - stamp_ns[:1]) / SECOND
     pads = calibration.layout.pads
     result = fit_creep(seconds, reading, calibration.noise, pads)
@@ -232,7 +232,7 @@ def fit_creep(
             "press harder, so that every pad is loaded"
         )
 
-    forecast = relaxed_share(FORECAST * hold_s / time)
+    forecast = compute_relaxed_share(FORECAST * hold_s / time)
     first, _, _ = _solve(means, load, noise, forecast, 1.0, FIRST_BEND)
     # The recording determines well only the amplitudes whose relaxation time lies between the time
     # of the first fitted reading and a third of the load's duration.

@@ -128,7 +128,7 @@ class Fit:
         )
 
 
-def compute_measured_stress(
+def measured_stress(
     base: Calibration,
     frequency: ArrayLike,
     temperature: Array | None = None,
@@ -164,7 +164,7 @@ def compute_measured_stress(
     return v
 
 
-def compute_loads_from_forces(
+def loads_from_forces(
     modes: Modes,
     force: Array,
     area: float,

@@ -19,7 +19,7 @@ from ..core.errors import ConfigError, FitError
 from ..core.layout import Layout
 from ..core.modes import Modes
 from ..core.symmetry import choose_default_modes
-from .fit import compute_loads_from_forces
+from .fit import loads_from_forces
 
 FORCE = ("fx", "fy", "fz")
 """Names of the columns of a table of loads that hold the force on the cube, in N."""
@@ -164,7 +164,7 @@ def _read_states(
         )
     by_axis = [columns[name] for name in FORCE]
     force = np.stack(by_axis, axis=1)
-    return compute_loads_from_forces(modes, force, area)
+    return loads_from_forces(modes, force, area)
 
 
 def _read_cells(path: Path) -> tuple[list[str], Array]:

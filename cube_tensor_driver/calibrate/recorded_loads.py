@@ -24,7 +24,7 @@ from ..core.rows import concatenate
 from ..core.symmetry import choose_default_modes
 from ..messages.codec import SECOND
 from ..messages.types import STRESS as BATCH_TYPE
-from .fit import compute_loads_from_forces
+from .fit import loads_from_forces
 from .load_table import Loads
 
 if TYPE_CHECKING:
@@ -258,7 +258,7 @@ def _read_reference(
             raise BagError(
                 f"{bag.path}: {topic} gives forces; give the area they act on in m² (--area)"
             )
-        return stamp_ns, compute_loads_from_forces(modes, values, area)
+        return stamp_ns, loads_from_forces(modes, values, area)
 
     # Columns after the stresses are gradients, in Pa/m. The amplitude of the mode (linear stress
     # field) that belongs to a gradient is the gradient times half the side of the cube.

@@ -119,7 +119,7 @@ def check_file(path: Path) -> int:
     from ..device.links.line_load import find_slow_lines
     from ..views.terminal.output import format_count, show_working
 
-    # `working` shows that the command is busy, because a skin of thousands of cubes takes seconds.
+    # `show_working` shows that the command is busy, as a skin of thousands of cubes takes seconds.
     with show_working(f"checking {path}"):
         skin, mistakes = check_skin(path)
         # Implausible poses, and serial lines that are too slow for the sampling rate, can only be

@@ -40,10 +40,10 @@ from .kernel.contract import (
 from .kernel.rows import (
     N_COMPONENTS,
     apply_law,
+    compute_temperature_factor,
     find_existing,
     mask_bits,
     pack_bits,
-    temperature_factor,
 )
 from .kernel.run import run
 from .modes import GRADIENT, STRESS
@@ -248,7 +248,7 @@ class Pipeline:
             offset: Offsets o (N, P), stress / stiffness; None: those of the newest rows.
         """
         calibration = self._tables.calibration[cube]
-        factor = temperature_factor(self._tables, calibration, temperature)
+        factor = compute_temperature_factor(self._tables, calibration, temperature)
         if offset is None and self.newest_offset is not None:
             offset = self.newest_offset[cube].astype(float)
         if offset is None:

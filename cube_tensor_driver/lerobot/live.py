@@ -63,7 +63,7 @@ If the sampling period is longer, the period is the maximum age, because no newe
 """
 
 CATCH_UP_S = 0.02
-"""Longest time, in s, for which `next_picture` waits until no unread sample is older than
+"""Longest time, in s, for which `take_next_picture` waits until no unread sample is older than
 `MAX_AGE_NS`.
 
 A sample passes through two threads, and Python runs only one thread at a time. While the recorder

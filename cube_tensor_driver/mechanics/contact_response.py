@@ -67,8 +67,8 @@ class ContactResponse:
         if cubes.spectra is not cubes.point_spectra:
             self._response = self._tabulate_discs(cubes.spectra, bessel)
 
-        # For `response_to_forces` and `sensitivity`, the tables are matrices with one row for each
-        # pair of a radius and a distance.
+        # For `compute_response_to_forces` and `sensitivity`, the tables are matrices with one
+        # row for each pair of a radius and a distance.
         width = 3 * len(self._order)
         rows = self._response.reshape(-1, width)
         self._rows = rows.astype(np.float32)
@@ -124,7 +124,7 @@ class ContactResponse:
         measured = self._cubes.measure(circular, variant)
         return np.asarray(measured.swapaxes(1, 2))
 
-    def response_slopes(
+    def compute_response_slopes(
         self,
         place: Array,
         angle: Array,
@@ -237,7 +237,7 @@ class ContactResponse:
         shape = len(distance), 4, 3, -1
         return np.asarray(functions.reshape(shape))
 
-    def response_to_forces(
+    def compute_response_to_forces(
         self,
         place: Array,
         angle: Array,

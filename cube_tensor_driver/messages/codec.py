@@ -55,8 +55,8 @@ _FRAME_AT = _FRAME_LENGTH_AT + 4
 """Byte offset of the text of the frame id in a serialised message."""
 
 SHAPE_AT = _FRAME_LENGTH_AT
-"""Byte offset, from the start of a serialised message, of the bytes that `MessageCodec.shape_bytes`
-returns: length and text of the frame id, then the number of rows."""
+"""Byte offset, from the start of a serialised message, of the bytes that
+`MessageCodec.read_shape_bytes` returns: length and text of the frame id, then number of rows."""
 
 AnyRows = TypeVar("AnyRows", FrequencyRows, StressRows)
 

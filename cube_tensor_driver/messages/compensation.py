@@ -41,8 +41,8 @@ def encode_compensation(
         stamp_ns: Stamp of the messages of frequencies and stress to which the message belongs, in
             ns since the Unix epoch.
         motion: Motion of the skin; None: weight is not compensated.
-        states: Name of a compensated effect, one of `STATES` -> its state, as `Compensation.states`
-            returns it.
+        states: Name of a compensated effect, one of `STATES` -> its state, as
+            `Compensation.collect_states` returns it.
     """
     time_ns, state = motion or UNKNOWN_MOTION
     text = frame_id.encode() + b"\0"

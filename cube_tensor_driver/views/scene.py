@@ -216,7 +216,7 @@ class Ranges(NamedTuple):
         gradient: Gradient of the pressure, in Pa/m, that the longest arrow shows.
     """
 
-    choose_colours: float = 0.0
+    colours: float = 0.0
     traction: float = 0.0
     gradient: float = 0.0
 

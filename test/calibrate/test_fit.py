@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from cube_tensor_driver.calibrate.fit import (
-    compute_loads_from_forces,
-    compute_measured_stress,
     describe_mode,
     fit,
+    loads_from_forces,
+    measured_stress,
 )
 from cube_tensor_driver.core.calibration import Calibration, illustrative
 from cube_tensor_driver.core.errors import FitError
@@ -167,16 +167,16 @@ def test_readings_from_frequencies():
     )
     v = np.random.default_rng(0).normal(size=(5, 8)) * 1e3
     f = pad_frequency(v, c.rest_frequency * 1.001, c.beta, c.modulus)
-    np.testing.assert_allclose(compute_measured_stress(c, f, np.full(5, 35.0)), v, atol=1e-6)
+    np.testing.assert_allclose(measured_stress(c, f, np.full(5, 35.0)), v, atol=1e-6)
     f[2, 3] = 1e9
     with pytest.raises(FitError, match=r"load 3, pad -z\+x: 1e\+09 Hz"):
-        compute_measured_stress(c, f)
+        measured_stress(c, f)
     with pytest.raises(FitError, match=r"\(5, 4\).*8"):
-        compute_measured_stress(c, f[:, :4])
+        measured_stress(c, f[:, :4])
 
 
 def test_loads_from_a_reference_force_sensor():
-    states = compute_loads_from_forces(SPACE, np.array([[1.0, 2, -3]]), 1e-4)
+    states = loads_from_forces(SPACE, np.array([[1.0, 2, -3]]), 1e-4)
     assert dict(zip(SPACE.names, states[0], strict=True)) | {
         "zz": -3e4,
         "zx": 1e4,
@@ -184,7 +184,7 @@ def test_loads_from_a_reference_force_sensor():
     } == dict(zip(SPACE.names, states[0], strict=True))
     assert np.count_nonzero(states) == 3
     with pytest.raises(FitError, match="area"):
-        compute_loads_from_forces(SPACE, np.ones((1, 3)), 0)
+        loads_from_forces(SPACE, np.ones((1, 3)), 0)
 
 
 def test_without_gains_fewer_loads_are_enough():
@@ -224,7 +224,7 @@ def test_what_cannot_be_fitted_is_an_error_with_its_reason(change, words):
 
 def test_one_load_alone_settles_no_coefficient():
     c = illustrative("cube")
-    loads = compute_loads_from_forces(c.modes, np.array([[0, 0, -1.0]]), 1e-4)
+    loads = loads_from_forces(c.modes, np.array([[0, 0, -1.0]]), 1e-4)
     with pytest.raises(FitError, match=r"determine no coefficient.*add a load of"):
         fit(c.structure, loads, loads @ c.response.T)
 

@@ -22,7 +22,7 @@ from conftest import encoded
 from cube_tensor_driver.bags.metadata import make_typestore, quality
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.calibrate.creep import CreepFit, add_creep, compute_step_reading, fit_creep
-from cube_tensor_driver.calibrate.fit import compute_measured_stress
+from cube_tensor_driver.calibrate.fit import measured_stress
 from cube_tensor_driver.cli import main as cli
 from cube_tensor_driver.config.calibration import read_calibration
 from cube_tensor_driver.core.calibration import illustrative
@@ -61,9 +61,7 @@ def fitted(growth, exponent=0.2, seed=0) -> CreepFit:
     """The law from one recording of 10 min at 20 Hz: 10 s of rest, 9 min of load, recovery."""
     time = np.arange(0, 595, 0.05)
     frequency = measured(time, pressed(time, 10, 550), growth, exponent, seed)
-    return fit_creep(
-        time, compute_measured_stress(PLAIN, frequency), PLAIN.noise, PLAIN.layout.pads
-    )
+    return fit_creep(time, measured_stress(PLAIN, frequency), PLAIN.noise, PLAIN.layout.pads)
 
 
 def held_times(hold):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cube_tensor_driver.core.calibration import illustrative
-from cube_tensor_driver.core.compensation.low_pass import relaxed_share
+from cube_tensor_driver.core.compensation.low_pass import compute_relaxed_share
 from cube_tensor_driver.core.compensation.models import CreepModel
 from cube_tensor_driver.core.errors import CalibrationError, LayoutError
 from cube_tensor_driver.core.oscillator import pad_frequency
@@ -66,7 +66,7 @@ def rows_of(time: np.ndarray, pads: np.ndarray, cubes: int = 1) -> FrequencyRows
 
 def test_the_exponential_is_exact():
     ratio = np.concatenate([[0.0], np.geomspace(1e-12, 1e4, 1000)])
-    np.testing.assert_allclose(relaxed_share(ratio), -np.expm1(-ratio), rtol=1e-14)
+    np.testing.assert_allclose(compute_relaxed_share(ratio), -np.expm1(-ratio), rtol=1e-14)
 
 
 @pytest.mark.parametrize(("interval", "tolerance"), [(0.06, 0.5), (0.9, 3.0), (4.0, 15.0)])
@@ -100,7 +100,7 @@ def test_more_samples_on_a_straight_line_change_nothing():
         pads = np.minimum(time, 60)[:, None] * (LOAD @ RESPONSE.T) / 60
         reconstructor = Reconstructor([CREEPING], np.float64)
         reconstructor.process(rows_of(time, pads))
-        ends.append(reconstructor.compensation.states()["creep"])
+        ends.append(reconstructor.compensation.collect_states()["creep"])
     np.testing.assert_allclose(ends[1:], [ends[0]] * 2, rtol=1e-9, atol=1e-100)
 
 
@@ -134,7 +134,7 @@ def test_scans_at_once_and_from_a_recorded_state_are_the_scans_one_by_one_to_the
             # The rest frequencies change after the last row before the state, as by a tare.
             rest = singly.rest_frequency * (1 + 1e-4)
             singly.rest_frequency = rest
-            states = singly.compensation.states()
+            states = singly.compensation.collect_states()
             later = Reconstructor(skin)
             later.rest_frequency = rest
             later.compensation.restore(states)

@@ -245,7 +245,7 @@ def played(kernel, calibrations, seed: int, dtype=np.float32) -> list[object]:
             given = recorded if number % 3 == 2 else None
             found.append(reconstructor.process(rows, given))
             found.append(reconstructor.process_known(rows, recorded))
-            found += reconstructor.compensation.states().values()
+            found += reconstructor.compensation.collect_states().values()
             found += [array.copy() for array in reconstructor.compensation.offsets]
             found += [
                 health.state,

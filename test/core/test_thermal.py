@@ -85,7 +85,7 @@ def test_parts_and_a_restored_state_give_the_same_bits():
     expected = whole.process(rows)
     found = []
     for begin in range(0, len(rows), 7):
-        states = parts.compensation.states()
+        states = parts.compensation.collect_states()
         parts = Reconstructor([calibration([97.0, 21.0])])
         parts.compensation.restore(states)
         found.append(parts.process(rows.select(slice(begin, begin + 7))))

@@ -542,7 +542,7 @@ def test_paper_makes_its_pictures(monkeypatch, tmp_path):
     def bar():
         yield lambda done, total, what: told.append(done / total)
 
-    monkeypatch.setattr("cube_tensor_driver.views.terminal.output.progress_bar", bar)
+    monkeypatch.setattr("cube_tensor_driver.views.terminal.output.show_progress_bar", bar)
     monkeypatch.setattr("cube_tensor_design.figures.paper.run_experiments", one)
     monkeypatch.setattr("cube_tensor_design.paper.virtual_bench.CUBE_REFINEMENTS", 0)
     monkeypatch.setattr(rod_parts, "split_signals", lambda *_: np.ones((2, 5)))

@@ -34,7 +34,7 @@ def test_slopes_are_differences_of_the_response(responses):
     angle = random.uniform(-3, 3, 20)
     variant = np.zeros(20, np.intp)
     step, size = 1e-3 * DEPTH, 0.7 * DEPTH
-    slopes = responses.response_slopes(
+    slopes = responses.compute_response_slopes(
         place, angle, variant, np.full(20, size), np.tile(FORCE, (20, 1))
     )
 
@@ -66,7 +66,7 @@ def test_a_moment_is_a_pair_of_forces(responses):
     place = random.uniform(-2, 2, (20, 2)) * DEPTH
     angle, variant = np.zeros(20), np.zeros(20, np.intp)
     size, h = 0.7 * DEPTH, 1e-3 * DEPTH
-    slopes = responses.response_slopes(
+    slopes = responses.compute_response_slopes(
         place, angle, variant, np.full(20, size), np.tile(FORCE, (20, 1))
     )
     moment = 0.0
@@ -92,7 +92,7 @@ def test_distant_contacts_cause_stress_beyond_the_tables():
         )
         size, variant = 0.7 * DEPTH, np.zeros(1, np.intp)
         cubic = half_space.response(place[None], np.zeros(1), variant, size) @ FORCE
-        linear = half_space.response_to_forces(
+        linear = half_space.compute_response_to_forces(
             place[None], np.zeros(1), variant, np.array([size]), FORCE[None]
         )
         for found in (cubic, linear):

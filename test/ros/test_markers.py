@@ -68,13 +68,10 @@ def test_colours_are_the_table_s_ends_grey_where_unknown_and_monotonous_in_light
     shown = scene.choose_colours(quantity, np.array([-5.0, 0, 10, 99, np.nan]), 10.0)
     zero, top = np.array([0xFF, 0xFF, 0xCC]) / 255, np.array([0x80, 0x00, 0x26]) / 255
     np.testing.assert_allclose(shown, [zero, zero, top, top, scene.GREY])
-    lightness = scene.choose_colours(quantity, np.linspace(0, 10, 50), 10.0) @ [0.299, 0.587, 0.114]
+    luma = [0.299, 0.587, 0.114]
+    lightness = scene.choose_colours(quantity, np.linspace(0, 10, 50), 10.0) @ luma
     assert (np.diff(lightness) < 0).all()
-    signed = scene.choose_colours(QUANTITIES["zz"], np.array([-10.0, 0, 10]), 10.0) @ [
-        0.299,
-        0.587,
-        0.114,
-    ]
+    signed = scene.choose_colours(QUANTITIES["zz"], np.array([-10.0, 0, 10]), 10.0) @ luma
     assert signed[1] > 2 * max(signed[0], signed[2])
 
 

@@ -19,7 +19,7 @@ from cube_tensor_driver.touch.inverse import SurfaceInverse
 from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
 from cube_tensor_driver.touch.tracker.local_values import CubeNoise, LocalValues
 from cube_tensor_driver.touch.tracker.tracked_region import TrackedRegion
-from workshop.bench.contacts import BALL, bar, compute_values_under, ellipse
+from workshop.bench.contacts import BALL, compute_values_under, make_bar, make_ellipse
 
 DEPTH, PITCH, COUNT, LEAST = 4e-3, 12e-3, 7, 300.0
 PADS_NOISE = np.where(np.arange(15) < len(STRESS), 3.0, 3.0 / 2e-3)
@@ -324,7 +324,7 @@ def test_ten_balls_on_planar_cubes_have_their_forces(seed):
         place = random.uniform(-40e-3, 40e-3, 2)
         if all(np.linalg.norm(place - other) > 18e-3 for other in places):
             places.append(place)
-    shapes = [ellipse(6e-3, 6e-3, order=6) + np.array([*place, 0]) for place in places]
+    shapes = [make_ellipse(6e-3, 6e-3, order=6) + np.array([*place, 0]) for place in places]
     load = np.concatenate(shapes), np.zeros(2), np.array([0, 0.9, -3.0])
     values, tracker = (
         compute_values_under(bench, *load, random),
@@ -349,7 +349,9 @@ def test_a_refined_contact_has_its_force_while_others_are_still_to_be_fitted():
         centre = np.append(random.uniform(-56e-3, 56e-3, 2), 0)
         if all(np.linalg.norm(centre - other) > 22e-3 for other in centres):
             centres.append(centre)
-    tips = [ellipse(16e-3, 8e-3) @ rotation_from_rpy(0, 0, random.uniform(0, 6)).T for _ in centres]
+    tips = [
+        make_ellipse(16e-3, 8e-3) @ rotation_from_rpy(0, 0, random.uniform(0, 6)).T for _ in centres
+    ]
     shape = np.concatenate([tip + centre for tip, centre in zip(tips, centres, strict=True)])
     values = compute_values_under(bench, shape, np.zeros(2), np.array([0, 0.9, -3.0]), random)
     tracker, errors = ContactTracker(bench.inverse, LEAST), []
@@ -415,10 +417,10 @@ def test_a_cube_that_fails_during_a_contact(inverse, work_before):
 
 
 SHAPES = [
-    (ellipse(16e-3, 8e-3), CUBES[0], 8e-3, 0.005),
-    (bar(24e-3, 2e-3), CUBES[0], 8e-3, 0.005),
-    (bar(40e-3, 3e-3), CUBES[0], 12e-3, 0.01),
-    (bar(40e-3, 3e-3), CUBES[1], 8e-3, 0.01),
+    (make_ellipse(16e-3, 8e-3), CUBES[0], 8e-3, 0.005),
+    (make_bar(24e-3, 2e-3), CUBES[0], 8e-3, 0.005),
+    (make_bar(40e-3, 3e-3), CUBES[0], 12e-3, 0.01),
+    (make_bar(40e-3, 3e-3), CUBES[1], 8e-3, 0.01),
 ]
 
 
@@ -441,7 +443,7 @@ def test_fingertips_edges_and_rods_have_their_force_and_place(shape, cubes, pitc
 
 
 @pytest.mark.parametrize("outside", [0.5, 1.0])
-@pytest.mark.parametrize(("shape", "limit"), [(ellipse(5e-3, 5e-3), 0.01), (bar(1e-2, 1e-3), 0.1)])
+@pytest.mark.parametrize(("shape", "limit"), [(BALL, 0.01), (make_bar(1e-2, 1e-3), 0.1)])
 def test_beyond_the_outermost_cubes_the_stated_deviation_grows(shape, limit, outside):
     """No field is computed there. Without nodes beyond the border, the force of an edge was off by
     a fifth, far more than stated. The fit is kept in the next scan."""
@@ -484,7 +486,7 @@ def test_what_a_scan_has_no_time_for_is_done_in_the_next_ones(monkeypatch):
     """Sixteen balls at once: each scan makes two or three fits, and everybody keeps its id."""
     bench = TractionBench(Setting(), side=2)
     places = [(x, y) for x in (-27e-3, -9e-3, 9e-3, 27e-3) for y in (-27e-3, -9e-3, 9e-3, 27e-3)]
-    random, ball_shape = np.random.default_rng(2), ellipse(5e-3, 5e-3)
+    random, ball_shape = np.random.default_rng(2), make_ellipse(5e-3, 5e-3)
     shape = np.concatenate([ball_shape + np.array([*place, 0]) for place in places])
     values = compute_values_under(bench, shape, np.zeros(2), np.array([0.0, 0.3, -1.5]), random)
     tracker, made = ContactTracker(bench.inverse, LEAST), []
@@ -518,7 +520,7 @@ def test_a_fit_of_an_edge_follows_the_load_without_further_work():
     """Forces are linear in the values as long as the fit stays."""
     bench = TractionBench(Setting(), side=2)
     random, force = np.random.default_rng(12), np.array([0.6, -0.6, -3.0])
-    values = compute_values_under(bench, bar(24e-3, 2e-3), np.zeros(2), force, random)
+    values = compute_values_under(bench, make_bar(24e-3, 2e-3), np.zeros(2), force, random)
     tracker = ContactTracker(bench.inverse, LEAST)
     (before,) = tracker.update(values, max_work=np.inf)
     (after,) = tracker.update(1.2 * values, max_work=0)

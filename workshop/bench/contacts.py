@@ -66,7 +66,7 @@ class LoadShape(NamedTuple):
     outside: float | None = None
 
 
-def ellipse(length: float, width: float, order: int = 16) -> Array:
+def make_ellipse(length: float, width: float, order: int = 16) -> Array:
     """Return Hertz's pressure on an ellipse with 1 N, as point forces (see `LoadShape.forces`).
 
     Args:
@@ -79,7 +79,7 @@ def ellipse(length: float, width: float, order: int = 16) -> Array:
     return np.column_stack([scaled, forces[:, 2]])
 
 
-def punch(width: float) -> Array:
+def make_punch(width: float) -> Array:
     """Return the pressure under a rigid flat punch with 1 N, as point forces.
 
     Args:
@@ -89,7 +89,7 @@ def punch(width: float) -> Array:
     return np.column_stack([sources[:, :2], forces[:, 2]])
 
 
-def bar(length: float, width: float) -> Array:
+def make_bar(length: float, width: float) -> Array:
     """Return a pressure that is uniform along x and semi-elliptic along y, as point forces of 1 N.
 
     Args:
@@ -105,17 +105,17 @@ def bar(length: float, width: float) -> Array:
     return np.column_stack([x.ravel(), y.ravel(), force.ravel()])
 
 
-BALL = ellipse(5e-3, 5e-3)
+BALL = make_ellipse(5e-3, 5e-3)
 """Pressure of a ball with a contact width of 5 mm."""
 
 SHAPES = {
     "ball 5 mm": LoadShape(BALL),
-    "flat punch 8 mm": LoadShape(punch(8e-3)),
-    "flat punch 16 mm": LoadShape(punch(16e-3)),
-    "fingertip 16 x 8 mm": LoadShape(ellipse(16e-3, 8e-3)),
-    "edge 12 x 1 mm": LoadShape(bar(12e-3, 1e-3)),
-    "edge 24 x 2 mm": LoadShape(bar(24e-3, 2e-3)),
-    "rod 40 x 3 mm": LoadShape(bar(40e-3, 3e-3)),
+    "flat punch 8 mm": LoadShape(make_punch(8e-3)),
+    "flat punch 16 mm": LoadShape(make_punch(16e-3)),
+    "fingertip 16 x 8 mm": LoadShape(make_ellipse(16e-3, 8e-3)),
+    "edge 12 x 1 mm": LoadShape(make_bar(12e-3, 1e-3)),
+    "edge 24 x 2 mm": LoadShape(make_bar(24e-3, 2e-3)),
+    "rod 40 x 3 mm": LoadShape(make_bar(40e-3, 3e-3)),
     "two balls 1.2 pitches apart": LoadShape(BALL, apart=1.2),
     "ball half a pitch outside": LoadShape(BALL, outside=0.5),
     "ball a pitch outside": LoadShape(BALL, outside=1.0),

@@ -118,7 +118,7 @@ class Measurement:
 def bench_echo(cubes: int, bench: Bench) -> dict[str, Any]:
     """Measure only the echo: nodes that exchange messages of the same size without work on them."""
     settings = {"cubes": cubes, "rate_hz": bench.rate, "duration_s": bench.duration}
-    with _prepared() as progress:
+    with _prepare_domain() as progress:
         return settings | _measure_echo(cubes, bench, progress)
 
 
@@ -131,7 +131,7 @@ def bench_skin(cubes: int, bench: Bench) -> dict[str, Any]:
         cubes: Number of cubes, rounded up so that all hubs have the same number.
         bench: Settings.
     """
-    with _prepared() as progress:
+    with _prepare_domain() as progress:
         return _measure_both(cubes, bench, progress)
 
 
@@ -141,7 +141,7 @@ def bench_found(cubes: int, bench: Bench) -> dict[str, Any]:
     The skin runs once without and once with a subscriber of it, both with one of `stress`.
     """
     topic = bench.topic
-    with _prepared() as progress:
+    with _prepare_domain() as progress:
         without = _measure_skin(cubes, replace(bench, topic=""), progress)
         found = _measure_skin(cubes, bench, progress)
     chosen = {name: value for name, value in found.items() if name.startswith(("cpu_", topic))}
@@ -162,14 +162,14 @@ def bench_scale(
     figure: Path,
 ) -> dict[str, Any]:
     """Run `bench_skin` for several numbers of cubes, and draw a picture of the results."""
-    with _prepared() as progress:
+    with _prepare_domain() as progress:
         rows = [_measure_both(cubes, bench, progress) for cubes in counts]
     save(draw_scale(rows), figure)
     return {"rate_hz": bench.rate, "duration_s": bench.duration, "skins": rows}
 
 
 @contextmanager
-def _prepared() -> Iterator[Progress]:
+def _prepare_domain() -> Iterator[Progress]:
     """Set a DDS domain and show a progress bar.
 
     The bar is drawn only once a second, because this process receives no messages meanwhile.

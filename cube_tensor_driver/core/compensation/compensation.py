@@ -180,7 +180,7 @@ class Compensation:
         """Continue from recorded states, so that the next rows give the bits of the recording.
 
         Args:
-            states: States by name, as the method `states` returns them. An effect that is missing
+            states: States by name, as `collect_states` returns them. An effect that is missing
                 keeps its present state.
 
         Raises:
@@ -214,5 +214,5 @@ class Compensation:
             offsets.step_ns.view(float),
             offsets.since_ns.view(float),
             offsets.newest_ns.view(float),
-            *effect.parts(),
+            *effect.collect_parts(),
         ]

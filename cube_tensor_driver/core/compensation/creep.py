@@ -250,7 +250,7 @@ class Creep:
         ]
 
     def resume(self) -> None:
-        """Continue from a recorded state that was written into the arrays of `parts`."""
+        """Continue from a recorded state that was written into the arrays of `collect_parts`."""
         self._is_certain[:] = False
         self._update_certainty()
         # The state may have been recorded with other rest frequencies. A version that never occurs

@@ -52,7 +52,7 @@ sum.
 """
 
 
-def relaxed_share(ratio: Array) -> Array:
+def compute_relaxed_share(ratio: Array) -> Array:
     """Return 1 - exp(-ratio) for ratios from 0 on, with the same bits on every processor.
 
     The exponential function of a mathematical library differs in its last bit by processor.
@@ -75,7 +75,7 @@ def find_shares(ratio: Array) -> tuple[Array, Array]:
     Args:
         ratio: Length of an interval divided by the time constant of a filter, from 0 on.
     """
-    share = relaxed_share(ratio)
+    share = compute_relaxed_share(ratio)
     divisor = np.maximum(ratio, 1e-300)
     return share, np.where(ratio > 0, share / divisor, 1.0)
 

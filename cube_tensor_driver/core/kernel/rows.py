@@ -98,7 +98,7 @@ def apply_law(
         Pad stresses divided by the stiffness E (1 + beta) / beta (N, P), 0 for bad pads, and
         whether the frequency lies in the range of the law, 0 < f < f_highest (N, P).
     """
-    factor = temperature_factor(tables, tables.calibration[cube], temperature)
+    factor = compute_temperature_factor(tables, tables.calibration[cube], temperature)
     rest = (tables.rest[cube] * factor).astype(frequency.dtype)
     highest = (tables.highest[cube] * factor).astype(frequency.dtype)
     below = highest - frequency
@@ -108,7 +108,7 @@ def apply_law(
     return v, is_good
 
 
-def temperature_factor(
+def compute_temperature_factor(
     tables: Tables,
     calibration: Numbers,
     temperature: Real,

@@ -264,7 +264,7 @@ class Reconstruction(CubeNode):
             states: Mapping[str, Array] = {}
             if abs(stamp_ns - self._states_ns) >= STATES_PERIOD_NS:
                 self._states_ns = stamp_ns
-                states = compensation.states()
+                states = compensation.collect_states()
             if motion is not None or states:
                 frame_id = self._skin.parent_frame
                 data = encode_compensation(frame_id, stamp_ns, motion, states)

@@ -504,7 +504,7 @@ def _linearise_alike(
     all_sizes = np.repeat(sizes, cubes)
     all_forces = forces.reshape(-1, 3)
     all_forces = np.repeat(all_forces, cubes, axis=0)
-    slopes = response.response_slopes(
+    slopes = response.compute_response_slopes(
         positions,
         angles,
         variants,

@@ -671,7 +671,7 @@ def _update_stale_responses(
             sizes.append(np.full(len(cubes), np.exp(log_size)))
             forces.append(is_facing[:, None] * force)
             all_cubes.append(cubes)
-    measured = inverse.contact_response.response_to_forces(
+    measured = inverse.contact_response.compute_response_to_forces(
         np.concatenate(offsets),
         np.concatenate(angles),
         inverse.variant[np.concatenate(all_cubes)],
