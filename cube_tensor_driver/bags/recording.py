@@ -99,7 +99,7 @@ class Recording:
         """The skin (cubes, their poses and calibrations) in the last SkinInfo message."""
         return make_recorded_skin(self.infos[-1], self.settings[-1].calibrations)
 
-    def info_index_at(self, newest_ns: Times) -> Index:
+    def find_info_index(self, newest_ns: Times) -> Index:
         """Return the index in `infos` of the SkinInfo that applies to each message of frequencies.
 
         A SkinInfo message contains the cubes' poses, calibrations and rest frequencies. It applies
@@ -123,7 +123,7 @@ class Recording:
         A rest frequency is the frequency of a pad without load; a row is one sample of one cube.
         """
         newest_ns = rows.stamp_ns.max(initial=0, keepdims=True)
-        number = int(self.info_index_at(newest_ns)[0])
+        number = int(self.find_info_index(newest_ns)[0])
         return self.settings[number]
 
     def check_calibrations_stay(self) -> None:

@@ -185,7 +185,7 @@ class BagSource:
         times_ns = messages.group_by_message(messages.rows.stamp_ns)
         # A message without rows has no newest row, so the stamp in its header is used.
         newest_ns: Times = times_ns.max(axis=1) if times_ns.size else messages.stamp_ns
-        return self.recording.info_index_at(newest_ns)
+        return self.recording.find_info_index(newest_ns)
 
 
 def _begins_segment(

@@ -113,7 +113,7 @@ def test_message_by_message_too_and_again_after_a_jump_back(bag):
             for k in range(0, len(messages.rows), 16)
         ]
     for k in [*range(MESSAGES), *range(80, 120), *range(0, 10), 150, 3]:
-        stress = reconstructor.process(rows[k], recording.health_at(rows[k], reconstructor))
+        stress = reconstructor.process(rows[k], recording.find_health(rows[k], reconstructor))
         assert_same([stress], [recorded[k]])
     recording.close()
 

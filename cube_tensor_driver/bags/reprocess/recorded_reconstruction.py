@@ -44,7 +44,7 @@ class RecordedReconstruction:
         """Close the bag."""
         self._source.bag.close()
 
-    def health_at(
+    def find_health(
         self,
         rows: FrequencyRows,
         reconstructor: Reconstructor,
@@ -68,7 +68,7 @@ class RecordedReconstruction:
             reconstructor.rest_frequency = settings.rest_frequency
         return self._source.recording.health.at(rows)
 
-    def compensation_at(
+    def find_compensation(
         self,
         stamp_ns: int,
         reconstructor: Reconstructor,

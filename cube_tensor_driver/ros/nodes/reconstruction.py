@@ -210,7 +210,7 @@ class Reconstruction(CubeNode):
             self._check_scans(rows)
             with self._lock:
                 recorded = self._recorded
-                health = recorded.health_at(rows, self._reconstructor) if recorded else None
+                health = recorded.find_health(rows, self._reconstructor) if recorded else None
                 out = self._publisher.make_rows(rows, frame_id)
                 rows = self._note_compensation(rows, stamp_ns)
                 rest_changes = self._reconstructor.rest_changes
@@ -249,7 +249,7 @@ class Reconstruction(CubeNode):
         problem = ""
         motion: Motion | None = None
         if self._recorded:
-            motion = self._recorded.compensation_at(stamp_ns, self._reconstructor)
+            motion = self._recorded.find_compensation(stamp_ns, self._reconstructor)
         elif self._motion:
             try:
                 last_ns = int(rows.stamp_ns.max(initial=stamp_ns))
