@@ -423,7 +423,7 @@ def read_chunk(content: bytes) -> tuple[Chunk, bytes]:
     return chunk, stream.read(size)
 
 
-def rosbag2_metadata(file: FileSummary) -> dict[str, str]:
+def make_rosbag2_metadata(file: FileSummary) -> dict[str, str]:
     """Return the content of the metadata record that rosbag2 reads if metadata.yaml is missing.
 
     Args:

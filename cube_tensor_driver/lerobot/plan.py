@@ -99,7 +99,7 @@ class Episode(NamedTuple):
     begin_ns: int
     frames: range
 
-    def blocks(self, length: int) -> list[range]:
+    def divide_into_blocks(self, length: int) -> list[range]:
         """Divide the frames into blocks of `length` frames; the last block may be shorter."""
         return [
             self.frames[k : k + length]

@@ -241,7 +241,7 @@ def _find_nested_paths(fields: Fielddefs, prefix: str) -> Iterator[str | None]:
 
     Args:
         fields: Name and kind (type, as the library rosbags describes it) of each field, as
-            `message_fields` returns them.
+            `list_message_fields` returns them.
         prefix: Path from the outermost message to these fields, ending in "."; "" if they are the
             fields of the outermost message itself.
 

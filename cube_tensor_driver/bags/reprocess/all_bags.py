@@ -145,7 +145,7 @@ def reprocess_all(
             yield futures[future], error
 
 
-def workers(wanted: int | None, jobs: int) -> Executor:
+def start_workers(wanted: int | None, jobs: int) -> Executor:
     """Return an executor with worker processes, which end when its `with` block ends.
 
     Args:

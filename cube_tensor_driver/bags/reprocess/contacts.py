@@ -94,7 +94,7 @@ class ContactWriter:
         Raises:
             CubeError: Contacts cannot be computed on a skin with these cubes.
         """
-        if self._geometry == geometry(info):
+        if self._geometry == describe_geometry(info):
             # The new message states other rest frequencies, found by a tare or by tracking of
             # drift. The stress changes with them, which must not count as a touch.
             if info is not self._info:

@@ -280,7 +280,9 @@ class HubClock:
             self._step_us = 0
         arrival = arrival_ns - track.first_ns
         if self._step_us:
-            self._decide(self.line.height(1000 * (newest_us - track.first_us), arrival), arrival_ns)
+            self._decide(
+                self.line.compute_height(1000 * (newest_us - track.first_us), arrival), arrival_ns
+            )
         # While the hub's clock stands still, or a step is undecided, delays are unknown.
         if not self._is_still and not self._step_us:
             device_ns = 1000 * (newest_us - track.first_us)
