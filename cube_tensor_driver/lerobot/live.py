@@ -56,8 +56,8 @@ MIN_HEIGHT = 4 * MIN_SQUARE
 (`NUMBER_GRID`), covers at most half of it."""
 
 MAX_AGE_NS = 5_000_000
-"""Maximum age, in ns, of the newest sample when a frame is made. `next_picture` waits for a newer
-one, but at most for `CATCH_UP_S`.
+"""Maximum age, in ns, of the newest sample when a frame is made. `take_next_picture` waits for a
+newer one, but at most for `CATCH_UP_S`.
 
 If the sampling period is longer, the period is the maximum age, because no newer sample need exist.
 """

@@ -346,7 +346,7 @@ def make_gradient_arrows(
     in_cube = gradient * length
     arrow = np.einsum("nij,nj->ni", poses.rotation[:, :, :2], in_cube)
     # The arrows lie a little above the upper faces, so that the faces do not hide the arrows.
-    tail = above(poses, 1.15)
+    tail = compute_points_above(poses, 1.15)
     return np.stack([tail, tail + arrow], axis=1)
 
 
@@ -402,7 +402,7 @@ def make_fault_crosses(poses: CubePoses, health: AnyArray) -> Array:
     scaled = ends * poses.half_side[:, None, None, None]
     in_parent = np.einsum("nij,nabj->nabi", poses.rotation, scaled)
     # The crosses lie a little above the upper faces, so that the faces do not hide the crosses.
-    centre = above(poses, CROSS_HEIGHT)
+    centre = compute_points_above(poses, CROSS_HEIGHT)
     return np.asarray(centre[:, None, None] + in_parent)
 
 

@@ -164,7 +164,7 @@ class Compensation:
         found: Array = np.nan_to_num(np.concatenate(errors, axis=2))
         return found
 
-    def states(self) -> dict[str, Array]:
+    def collect_states(self) -> dict[str, Array]:
         """Return the states of creep and of the effect of temperature (n,), by name of the effect.
 
         A state holds all that later rows need of the earlier ones: after `restore` has set it, the

@@ -231,7 +231,7 @@ class Creep:
         np.minimum(largest, np.abs(self._reading), out=largest, where=shift != 0)
         return bool(shift.any())
 
-    def parts(self) -> list[Array]:
+    def collect_parts(self) -> list[Array]:
         """Return the arrays that hold all that later rows need of the earlier ones (the state).
 
         To restore a recorded state, write into them and call `resume`.

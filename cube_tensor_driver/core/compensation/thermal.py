@@ -183,7 +183,7 @@ class Thermal:
         )
         return np.concatenate([size[cubes] * by[:, None] for size, by in by_cause], axis=2)
 
-    def parts(self) -> list[Array]:
+    def collect_parts(self) -> list[Array]:
         """Return the arrays that hold all that later rows need of the earlier ones (the state).
 
         To restore a recorded state, write into them and call `resume`.

@@ -226,7 +226,7 @@ class HubClock:
 
         Args:
             height: Delay of the newest sample beyond the smallest one, in ns, if the hub's clock
-                was not set (`ClockLine.height`).
+                was not set (`ClockLine.compute_height`).
             arrival_ns: Host time at which the sample arrived.
         """
         self._n_reads += 1

@@ -229,7 +229,7 @@ class LiveTable:
             columns: Cells of each column by its heading.
             has_lines: Whether lines separate the columns.
         """
-        count = counted(len(self._skin.cubes), "cube")
+        count = format_count(len(self._skin.cubes), "cube")
         title = f"skin {self._skin.name!r}: {count}. Tension is positive; "
         table = Table(title=f"{title}{UNOBSERVED} is not observed{self.note}")
         # Without lines, the table of a skin of planar cubes is not wider than 80 characters.
