@@ -46,7 +46,7 @@ this ratio, one ring of point forces represents the contact accurately enough fo
 
 def default_script() -> Script:
     """Read the load script in the package, in which an indenter moves over a skin of any size."""
-    return read_script(package_data() / "config" / "load_demo.yaml")
+    return read_script(find_package_data() / "config" / "load_demo.yaml")
 
 
 StressField = tuple[Array, Array]

@@ -86,7 +86,7 @@ class ClockLine:
         self._answered_ns = 0.0  # device time for which the bounds hold
         self._set_bounded_offset()
 
-    def height(self, device_ns: float, arrival_ns: float) -> float:
+    def compute_height(self, device_ns: float, arrival_ns: float) -> float:
         """Return the height of a point above the line: its delay beyond the smallest, in ns.
 
         Args:

@@ -405,7 +405,7 @@ class SampleAccount:
             **total,
         }
 
-    def _total(self) -> SequenceCounters:
+    def _sum_parts(self) -> SequenceCounters:
         """Return the sums of the counters of all parts (frames into which a sample is divided).
 
         Parts that the hub no longer sends are included; samples counted by the module in C are not.
