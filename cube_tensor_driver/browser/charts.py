@@ -153,7 +153,7 @@ class Charts:
                 self.plots.append(plot)
             files = gui.add_button_group("save as", ("CSV", "PNG"))
             zoom = "To zoom, pause the page and drag. A double click shows all again."
-            gui.add_html(markup.box(zoom))
+            gui.add_html(markup.put_in_box(zoom))
 
         @files.on_click
         def _(event: viser.GuiEvent[viser.GuiButtonGroupHandle]) -> None:

@@ -136,8 +136,8 @@ class ReplayControls:
         steps = math.ceil(replay.length / SLIDER_STEP_S)
         self._slider.max = max(round(steps * SLIDER_STEP_S, 1), SLIDER_STEP_S)
         self._move_slider(round(min(replay.position, self._slider.max), 1))
-        position, length = markup.clock(replay.position), markup.clock(replay.length)
-        self._position.content = markup.box(f"<b>{position}</b> of {length}")
+        position, length = markup.format_clock(replay.position), markup.format_clock(replay.length)
+        self._position.content = markup.put_in_box(f"<b>{position}</b> of {length}")
         self._button.label = "go on with the replay" if replay.paused else "stop the replay"
 
     def _move_slider(self, position: float) -> None:

@@ -69,7 +69,7 @@ def make_secret_address() -> str:
     return address
 
 
-def refusal(
+def find_refusal(
     host: str,
     origin: str | None,
     *,
@@ -208,7 +208,7 @@ class Gate:
         request, _, fields = head.partition(b"\r\n")
         headers = http.client.parse_headers(io.BytesIO(fields))
         host = headers.get("Host", "")
-        problem = refusal(host, headers.get("Origin"), local=not self._token)
+        problem = find_refusal(host, headers.get("Origin"), local=not self._token)
         # A browser sends a cookie to every port of a host. Two servers on one host therefore need
         # cookies with different names, and the name contains the port.
         cookie = f"cube_view_{_split(host)[1]}={self._token}"

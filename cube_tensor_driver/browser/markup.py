@@ -119,7 +119,7 @@ class PageStatus:
         self.title, self.detail, self.colour = title, detail, colour
 
 
-def waiting(domain: str) -> str:
+def describe_waiting(domain: str) -> str:
     """Return the text that page and terminal show while no skin is published in a DDS domain."""
     return (
         f"Waiting for a skin: none is published in {domain}. "
@@ -127,7 +127,7 @@ def waiting(domain: str) -> str:
     )
 
 
-def box(content: str) -> str:
+def put_in_box(content: str) -> str:
     """Return HTML content inside a box with the margins that all texts of the page have."""
     return _make_div(BOX_STYLE, content)
 
@@ -143,7 +143,7 @@ def label(name: str) -> str:
     return f"∂σ{name[:2]}/∂{name[3]}" if "_" in name else f"σ{name}"
 
 
-def clock(seconds: float) -> str:
+def format_clock(seconds: float) -> str:
     """Return a duration in seconds as text, such as "12.3 s" or "3 min 12.3 s"."""
     minutes, rest = divmod(round(seconds, 1), 60)
     return f"{minutes:.0f} min {rest:.1f} s" if minutes else f"{rest:.1f} s"
@@ -161,7 +161,7 @@ def format_newtons(contact: Contact) -> str:
     return f"{about}{contact.normal_force:.2f} N{shear}{slips}"
 
 
-def headline(
+def make_headline(
     scan: Scan,
     paused: bool,
     recording: bool,
@@ -194,10 +194,10 @@ def headline(
     ]
     if recording:
         parts.append(f"<b style='color:{RED}'>● recording</b>")
-    return box(" · ".join(parts))
+    return put_in_box(" · ".join(parts))
 
 
-def legend(
+def make_legend(
     quantity: scene.Quantity,
     top: float,
     field: SurfaceField,
@@ -211,7 +211,7 @@ def legend(
             pressure and it is unknown (`field.sigma` is None), the text `NO_DEVIATION` is returned.
     """
     if quantity is DEVIATION and field.sigma is None:
-        return box(NO_DEVIATION)
+        return put_in_box(NO_DEVIATION)
     values = np.linspace(-top if quantity.signed else 0, top, LEGEND_STEPS)
     fractions = scene.choose_colours(quantity, values, top)
     colours = (255 * fractions).astype(int).tolist()
@@ -220,10 +220,10 @@ def legend(
     ticks = "".join(f"<span>{value / quantity.size:.3g}</span>" for value in values[::middle])
     meaning = f"{quantity.label} in {quantity.unit}; grey: unknown"
     bar = _make_div(BAR_STYLE.format(stops), "")
-    return box(bar + _make_div(TICKS_STYLE, ticks) + _make_div("text-align:center", meaning))
+    return put_in_box(bar + _make_div(TICKS_STYLE, ticks) + _make_div("text-align:center", meaning))
 
 
-def explanation(
+def make_explanation(
     bar: float,
     stress: float,
     gradient: float,
@@ -251,7 +251,7 @@ def explanation(
         "<b style='color:#2850dc'>blue</b> pushes</div>",
         "<div><b>✕</b> over a cube: see <i>health</i>. Axes: x red, y green, z blue</div>",
     ]
-    return box("".join(lines))
+    return put_in_box("".join(lines))
 
 
 def _find_typical(sigma: Array | None) -> str:
@@ -266,7 +266,7 @@ def _find_typical(sigma: Array | None) -> str:
     return f", ±&nbsp;{np.median(known) / 1e3:.2g}&nbsp;kPa" if len(known) else ""
 
 
-def numbers(scan: Scan, cube: int, above: Array | None) -> str:
+def make_numbers_table(scan: Scan, cube: int, above: Array | None) -> str:
     """Return an HTML table of a cube's observed components, residual, sampling rate and state.
 
     Args:
@@ -288,19 +288,19 @@ def numbers(scan: Scan, cube: int, above: Array | None) -> str:
     status = describe_status(scan.status[cube])
     state = status or HEALTH_WORDS[scan.health[cube]]
     rows.append(("state", state, ""))
-    return box(_make_table(rows))
+    return put_in_box(_make_table(rows))
 
 
-def contacts(scan: Scan) -> str:
+def make_contacts_table(scan: Scan) -> str:
     """Return an HTML table of the position and the forces of each contact, strongest first."""
     rows = []
     for contact in scan.contacts:
         x, y, z = 1e3 * contact.position
         rows.append((f"{x:.1f}, {y:.1f}, {z:.1f} mm", format_newtons(contact), ""))
-    return box(_make_table(rows) if rows else "none")
+    return put_in_box(_make_table(rows) if rows else "none")
 
 
-def conditions(names: list[str], scan: Scan) -> str:
+def describe_conditions(names: list[str], scan: Scan) -> str:
     """Return HTML about the health of a skin: links, number of cubes per state, cubes with a fault.
 
     Args:
@@ -317,7 +317,7 @@ def conditions(names: list[str], scan: Scan) -> str:
         _make_div(f"color:{LEVEL_COLOURS[level]}", escape(line))
         for line, level in (*scan.links, (counts, 0))
     )
-    return box(lines + _make_table(rows))
+    return put_in_box(lines + _make_table(rows))
 
 
 def _make_div(style: str, content: str) -> str:

@@ -247,7 +247,7 @@ class Page:
             self._view.options = view
         if status.action != self._noted:
             self._noted = status.action
-            self._action.content = markup.box(escape(status.action))
+            self._action.content = markup.put_in_box(escape(status.action))
             self._client.add_notification(
                 status.title,
                 status.detail,
@@ -366,7 +366,7 @@ def show_waiting(
         text: The text, as HTML.
     """
     set_up(client, layout, "cube_tensor_driver")
-    client.gui.add_html(markup.STYLE + markup.box(text))
+    client.gui.add_html(markup.STYLE + markup.put_in_box(text))
     client.scene.add_label(
         "/waiting",
         "Waiting for a skin …",

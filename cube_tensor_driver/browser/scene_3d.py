@@ -328,7 +328,7 @@ class Scene:
             update[name] = {"points": points.astype(np.float32)}
         return update
 
-    def per_bar(self, ranges: scene.Ranges) -> tuple[float, float]:
+    def find_values_per_bar(self, ranges: scene.Ranges) -> tuple[float, float]:
         """Return the values whose arrows are as long as the scale bar.
 
         Args:

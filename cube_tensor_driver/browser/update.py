@@ -128,16 +128,16 @@ def build_update(
     above = None if colouring.above is None else colouring.above[cube]
     # Each text is the content of an HTML element of the same name (page.py).
     texts = {
-        "headline": markup.headline(scan, settings.is_paused, settings.is_recording),
-        "legend": markup.legend(settings.quantity, colouring.top, scan.field),
-        "meaning": markup.explanation(
+        "headline": markup.make_headline(scan, settings.is_paused, settings.is_recording),
+        "legend": markup.make_legend(settings.quantity, colouring.top, scan.field),
+        "meaning": markup.make_explanation(
             skin.scene.bar,
-            *skin.scene.per_bar(ranges),
+            *skin.scene.find_values_per_bar(ranges),
             scan.field,
         ),
-        "numbers": markup.numbers(scan, cube, above),
-        "contact list": markup.contacts(scan),
-        "health": markup.conditions(skin.names, scan),
+        "numbers": markup.make_numbers_table(scan, cube, above),
+        "contact list": markup.make_contacts_table(scan),
+        "health": markup.describe_conditions(skin.names, scan),
     }
     update |= {name: {"content": text} for name, text in texts.items()}
     for number, chart in enumerate(settings.charts):

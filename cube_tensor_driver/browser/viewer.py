@@ -214,7 +214,7 @@ class Viewer:
             )
         elif self._shown is None and now_s >= self._waiting_note_s:
             self._waiting_note_s = math.inf
-            print(markup.waiting(describe_domain()), flush=True)
+            print(markup.describe_waiting(describe_domain()), flush=True)
 
     def close(self) -> None:
         """End a recording that runs, and stop the server."""
@@ -260,7 +260,7 @@ class Viewer:
         size = client.camera.image_width, client.camera.image_height
         layout = self._layouts.setdefault(client.client_id, PageLayout(*size))
         if self._shown is None:
-            show_waiting(client, layout, markup.waiting(describe_domain()))
+            show_waiting(client, layout, markup.describe_waiting(describe_domain()))
             return
 
         def act(action: str, *arguments: object) -> None:

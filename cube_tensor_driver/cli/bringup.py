@@ -84,7 +84,7 @@ def run(options: argparse.Namespace) -> int:
     from ..device.live import open_links
     from ..views.terminal.output import say
 
-    data, skin = skin_of_hub(options)
+    data, skin = describe_skin_of_hub(options)
     names = [cube.name for cube in skin.cubes]
     pads = skin.cubes[0].calibration.layout.pads
     with open_links(skin) as source:
@@ -106,7 +106,7 @@ def run(options: argparse.Namespace) -> int:
     return 0 if np.all(rest.works & ~rest.noisy) else 1
 
 
-def skin_of_hub(options: argparse.Namespace) -> tuple[dict[str, Any], Skin]:
+def describe_skin_of_hub(options: argparse.Namespace) -> tuple[dict[str, Any], Skin]:
     """Ask the hub at the port for its cubes, and describe them as a skin.
 
     Args:

@@ -19,7 +19,7 @@ import threading
 from collections.abc import Sequence
 
 from ..processes.stop_signals import INTERRUPTED
-from .parser import Parser, check_outputs, columns, nearest, sentence
+from .parser import Parser, check_outputs, columns, make_sentence, suggest_nearest
 from .table import COMMANDS, GROUPS, PACKAGES
 
 PROGRAM = "./cube"
@@ -118,12 +118,12 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         print(make_help_text())
         raise SystemExit(0)
     if words[0] == "--version":
-        print(f"cube_tensor_driver {version()}")
+        print(f"cube_tensor_driver {find_version()}")
         raise SystemExit(0)
-    return command_parser(words[0]).parse_args(words[1:])
+    return make_command_parser(words[0]).parse_args(words[1:])
 
 
-def command_parser(name: str) -> Parser:
+def make_command_parser(name: str) -> Parser:
     """Return the parser of the options of a command.
 
     Args:
@@ -138,7 +138,7 @@ def command_parser(name: str) -> Parser:
         Parser(prog=PROGRAM).error("--distro is an option of ./cube in a checkout")
     if name not in COMMANDS:
         kind = "option" if name.startswith("-") else "command"
-        close = nearest(name, [*COMMANDS, "help", "--help", "--version", "--distro"])
+        close = suggest_nearest(name, [*COMMANDS, "help", "--help", "--version", "--distro"])
         Parser(prog=PROGRAM).error(f"unknown {kind} {name}; {close}")
 
     # Commands for designers and developers are not part of the driver's package, see `PACKAGES`.
@@ -152,7 +152,7 @@ def command_parser(name: str) -> Parser:
         Parser(prog=PROGRAM).error(
             f"the command {name} is not part of the driver: run it as ./cube {name} in a checkout"
         )
-    parser = Parser(prog=f"{PROGRAM} {name}", description=sentence(COMMANDS[name]))
+    parser = Parser(prog=f"{PROGRAM} {name}", description=make_sentence(COMMANDS[name]))
     module.add_arguments(parser)
     parser.set_defaults(run=module.run)
     return parser
@@ -184,7 +184,7 @@ def make_help_text() -> str:
     return "\n".join([*lines, "", *textwrap.wrap(last, width)])
 
 
-def version() -> str:
+def find_version() -> str:
     """Return the version of the package.
 
     In a checkout and in an install space of ROS, it is read from package.xml. If pip installed the

@@ -39,14 +39,14 @@ def run(options: argparse.Namespace) -> int:
         print("\n".join(list_nodes()))
     elif options.value is not None:
         value = set_parameter(options.node, options.name, options.value)
-        print(f"{options.name}: {shown(value)}")
+        print(f"{options.name}: {format_value(value)}")
     else:
         for name, value in read_parameters(options.node, options.name).items():
-            print(f"{name}: {shown(value)}")
+            print(f"{name}: {format_value(value)}")
     return 0
 
 
-def shown(value: object) -> str:
+def format_value(value: object) -> str:
     """Return the value of a parameter as YAML on one line."""
     from ..config.yaml import to_yaml
 

@@ -45,7 +45,7 @@ class Parser(argparse.ArgumentParser):
         self._subcommands: argparse._SubParsersAction[Parser] | None = None
         self._passes_words = False
         self._missing = ""
-        settings.setdefault("formatter_class", formatter)
+        settings.setdefault("formatter_class", make_formatter)
         super().__init__(**settings)
 
     def add_argument(self, *flags: str, **settings: Any) -> argparse.Action:
@@ -191,7 +191,9 @@ class Parser(argparse.ArgumentParser):
                 metavar="WHAT",
                 required=True,
             )
-        added: Parser = self._subcommands.add_parser(name, help=text, description=sentence(text))
+        added: Parser = self._subcommands.add_parser(
+            name, help=text, description=make_sentence(text)
+        )
         return added
 
     def add_words(
@@ -248,7 +250,7 @@ class Parser(argparse.ArgumentParser):
             if word is None and not wants_help:
                 self.error(f"one of these has to follow: {', '.join(known)}")
             if word is not None and word not in known:
-                self.error(f"unknown command {word}; {nearest(word, known)}")
+                self.error(f"unknown command {word}; {suggest_nearest(word, known)}")
             return
         for word in words:
             if word == "--":
@@ -262,7 +264,7 @@ class Parser(argparse.ArgumentParser):
             else:
                 continue
             if not fits:
-                self.error(f"unknown option {flag}; {nearest(flag, self._flags)}")
+                self.error(f"unknown option {flag}; {suggest_nearest(flag, self._flags)}")
 
     def error(self, message: str) -> NoReturn:
         """Print an error message and the command that prints the help, and exit with code 2."""
@@ -274,7 +276,7 @@ class Parser(argparse.ArgumentParser):
         return f"cube: {name}: " if name else "cube: "
 
 
-def formatter(prog: str) -> argparse.HelpFormatter:
+def make_formatter(prog: str) -> argparse.HelpFormatter:
     """Return a formatter of help texts for the width of the terminal."""
     return argparse.HelpFormatter(prog, width=columns() - 2)
 
@@ -284,12 +286,12 @@ def columns() -> int:
     return min(shutil.get_terminal_size().columns, MAX_WIDTH)
 
 
-def sentence(text: str) -> str:
+def make_sentence(text: str) -> str:
     """Return a line of help with a capital letter at its beginning and a full stop at its end."""
     return f"{text[0].upper()}{text[1:]}."
 
 
-def nearest(word: str, known: Iterable[str]) -> str:
+def suggest_nearest(word: str, known: Iterable[str]) -> str:
     """Return a question that suggests similar words, or else the list of all known words.
 
     Args:

@@ -61,7 +61,11 @@ def run(options: argparse.Namespace) -> int:
     from ..bags.read import Bag
     from ..ros.commands.replay import replay
 
-    with Bag(options.bag) as bag, browser(bag, options.view) as children, single_keys() as has_keys:
+    with (
+        Bag(options.bag) as bag,
+        run_browser(bag, options.view) as children,
+        read_single_keys() as has_keys,
+    ):
         length_s = (bag.end_ns - bag.start_ns) * 1e-9
         with replay_bar(has_keys) as bar:
             task = bar.add_task("replaying", total=length_s)
@@ -105,7 +109,7 @@ def obey(key: str, player: Player) -> None:
 
 
 @contextmanager
-def single_keys() -> Iterator[bool]:
+def read_single_keys() -> Iterator[bool]:
     """Set the terminal so that each key can be read at once, without Enter and without echo.
 
     The terminal is restored at the end of the `with` block.
@@ -160,7 +164,7 @@ def replay_bar(has_keys: bool) -> Progress:
 
 
 @contextmanager
-def browser(bag: Bag, wanted: bool) -> Iterator[Children]:
+def run_browser(bag: Bag, wanted: bool) -> Iterator[Children]:
     """Run the browser view as a child process inside a `with` block, if it is wanted.
 
     Args:

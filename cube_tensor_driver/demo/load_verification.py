@@ -67,7 +67,7 @@ class ForceHistory:
     measured_force: Array
     measured_centre: Array
 
-    def figures(self) -> dict[str, object]:
+    def compute_errors(self) -> dict[str, object]:
         """Return peak and rms error of the force per axis (N), and rms error of the centre (mm).
 
         The error of the centre of pressure is computed from times at which the skin is loaded, and
@@ -167,7 +167,7 @@ class LoadVerification:
         comparison = self._compare(self._stress)
         return comparison.received >= comparison.sent
 
-    def result(self) -> dict[str, object]:
+    def make_result(self) -> dict[str, object]:
         """Return counts, latencies and errors of the compared period, as the JSON file has them.
 
         Counts are rows (one cube at one sampling time), times are in ms. Errors of the tensors are
@@ -282,7 +282,7 @@ class LoadVerification:
         return {
             "error_rel_rms": rms(relative),
             "error_rel_worst": float(np.nanmax(np.abs(relative))),
-            "error_over_noise": rms(error / component_noise(self._skin)),
+            "error_over_noise": rms(error / compute_component_noise(self._skin)),
         }
 
     def _compute_truth(self, seconds: float) -> Array:
@@ -299,7 +299,7 @@ def rms(values: AnyArray) -> float:
     return float(np.sqrt(np.nanmean(values**2)))
 
 
-def component_noise(skin: Skin) -> Array:
+def compute_component_noise(skin: Skin) -> Array:
     """Compute the standard deviation that the noise of the pads causes in each component.
 
     Args:

@@ -114,7 +114,7 @@ class Observer:
 
 
 @contextmanager
-def observing(
+def observe_skin(
     name: str,
     children: Children,
     *,

@@ -32,7 +32,7 @@ class Usage:
         self._start_s = time.monotonic()
         self._start_cpu_s = self._sum_cpu_seconds()
 
-    def cpu_percent(self) -> dict[str, float]:
+    def measure_cpu_percent(self) -> dict[str, float]:
         """Return the processor time of each process since this object was made, divided by the
         elapsed time, in percent of one core."""
         elapsed_s = time.monotonic() - self._start_s
@@ -42,7 +42,7 @@ class Usage:
             percent[name] = 100 * used_s / elapsed_s
         return percent
 
-    def memory_mb(self) -> dict[str, float]:
+    def measure_memory_mb(self) -> dict[str, float]:
         """Return the resident memory of each process, in MiB."""
         return {
             name: process.memory_info().rss / BYTES_PER_MB

@@ -26,7 +26,7 @@ from ..ros.session import describe_domain, node_session, spin_until
 from ..simulation.imperfections import read_imperfections
 from ..simulation.load import read_load
 from ..views.terminal.live_table import LiveTable
-from .running import Interrupted, Observer, end_simulator, observing
+from .running import Interrupted, Observer, end_simulator, observe_skin
 
 if TYPE_CHECKING:
     from .demo import DemoSettings
@@ -98,7 +98,7 @@ class DemoResult:
             cubes=self.verification.load.poses.position,
         )
         save(picture, path)
-        return forces.figures()
+        return forces.compute_errors()
 
 
 def watch(
@@ -144,7 +144,7 @@ def watch(
     with ExitStack() as stack:
         table = stack.enter_context(LiveTable(skin, show=not settings.headless))
         observer = stack.enter_context(
-            observing(
+            observe_skin(
                 "demo",
                 children,
                 interrupted=interrupted,
@@ -324,8 +324,8 @@ class SkinWatcher:
         usage = Usage(self._children, MEASURED_NODES)
         spin(duration)
         self._check_alone()
-        cpu = usage.cpu_percent()
-        memory = usage.memory_mb()
+        cpu = usage.measure_cpu_percent()
+        memory = usage.measure_memory_mb()
         end_ns = start_ns + round(duration * 1e9)
 
         # On a busy machine the simulator takes its samples late. It must not end before it has
@@ -337,7 +337,7 @@ class SkinWatcher:
         spin(MAX_LATE_S, verification.is_complete)
         self._check_alone()
         return {
-            **verification.result(),
+            **verification.make_result(),
             "crc_errors": sum(self._crc_errors.values()),
             **{f"cpu_{name}_percent": round(value, 1) for name, value in cpu.items()},
             **{f"rss_{name}_mb": round(value, 1) for name, value in memory.items()},

@@ -24,7 +24,7 @@ from websockets.sync.client import connect
 
 from cube_tensor_driver.browser.charts import format_csv
 from cube_tensor_driver.browser.controls import ColourControls
-from cube_tensor_driver.browser.gate import Gate, make_secret_address, refusal
+from cube_tensor_driver.browser.gate import Gate, find_refusal, make_secret_address
 from cube_tensor_driver.browser.history import History
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.modes import COMPONENTS
@@ -54,7 +54,7 @@ HERE = "127.0.0.1"
     ],
 )
 def test_only_this_page_is_answered(host: str, origin: str | None, word: str) -> None:
-    found = refusal(host, origin)
+    found = find_refusal(host, origin)
     assert word in found and bool(word) == bool(found)
 
 

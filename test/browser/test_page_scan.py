@@ -173,8 +173,8 @@ def test_the_deviation_is_a_colour_while_the_node_says_it(poses, known):
     near = np.linalg.norm(surface.points - poses.position[2], axis=1)
     assert near[at] == near.min()
     said = f"{pressure[at] / 1e3:.2f} ± {sigma[at] / 1e3:.2f}"
-    assert said in markup.numbers(scan, 2, colouring.above[2])
-    assert "on the surface" not in markup.numbers(scan, 3, colouring.above[3])
+    assert said in markup.make_numbers_table(scan, 2, colouring.above[2])
+    assert "on the surface" not in markup.make_numbers_table(scan, 3, colouring.above[3])
 
 
 class Buffer:

@@ -271,7 +271,7 @@ def test_losses_of_a_link_are_a_warning_and_coloured_on_the_page(states, notes, 
     assert pairs(link) == {"lost_on_the_way": "5"}
     assert link.message == "; ".join(notes) or state.value
     scan = SimpleNamespace(health=np.zeros(1, int), links=((link.message, link.level[0]),))
-    html = markup.conditions(["c"], scan)
+    html = markup.describe_conditions(["c"], scan)
     colour = {b"\0": "inherit", b"\1": markup.AMBER}.get(level, markup.RED)
     assert f"color:{colour}'>{link.message}<" in html
 

@@ -27,7 +27,7 @@ from cube_tensor_driver.core.modes import COMPONENTS
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows, concatenate
-from cube_tensor_driver.demo.load_verification import component_noise
+from cube_tensor_driver.demo.load_verification import compute_component_noise
 from cube_tensor_driver.device.live import open_links
 from cube_tensor_driver.device.wire.decoder import Decoder
 from cube_tensor_driver.device.wire.protocol import Sample
@@ -212,7 +212,7 @@ def test_noise_of_the_calibration_gives_a_residual_of_one_and_the_stated_deviati
     assert np.sqrt(np.mean(rows.residual**2)) == pytest.approx(1.0, abs=0.05)
     skin = replace(SKIN, cubes=(replace(SKIN.cubes[0], calibration=calibration),))
     components = np.hstack([rows.stress, rows.gradient])
-    stated = component_noise(skin)[0]
+    stated = compute_component_noise(skin)[0]
     np.testing.assert_array_equal(np.isnan(stated), np.isnan(components[0]))
     observed = np.isfinite(stated)
     np.testing.assert_allclose(components[:, observed].std(axis=0), stated[observed], rtol=0.1)

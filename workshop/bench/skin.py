@@ -26,7 +26,7 @@ from rich.progress import Progress
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.arrays import Array, Index
 from cube_tensor_driver.core.errors import CubeError
-from cube_tensor_driver.demo.running import observing
+from cube_tensor_driver.demo.running import observe_skin
 from cube_tensor_driver.demo.usage import Usage
 from cube_tensor_driver.demo.verification import compare, percentile
 from cube_tensor_driver.messages.codec import stress_codec
@@ -234,7 +234,7 @@ def _measure_skin(
     # Only rows of the first cube of each hub were stored, because storing all would delay this
     # process. They are counted for all cubes of the hub.
     comparison = compare(taken, arrivals, measured.start_ns, measured.end_ns)
-    cpu = measured.cpu_percent
+    cpu = measured.measure_cpu_percent
     seconds = 1e-9 * (measured.end_ns - measured.start_ns)
     return {
         "samples_expected": round(bench.rate * seconds) * load.cubes,
@@ -245,7 +245,7 @@ def _measure_skin(
         "latency_p50_ms": percentile(comparison.latency_ms, 50),
         "latency_p99_ms": percentile(comparison.latency_ms, 99),
         **{f"cpu_{name}_percent": round(value, 1) for name, value in cpu.items()},
-        **summarise_memory(measured.memory_mb),
+        **summarise_memory(measured.measure_memory_mb),
         "first_tensor_s": round(measured.first_tensor_s, 2),
         **(_summarise_found(bench, np.array(found), taken, measured) if bench.topic else {}),
     }
@@ -335,7 +335,7 @@ def _measure_echo(
         part = replace(bench, duration=min(bench.duration / 2, MAX_ECHO_S))
         name = f"echo of {cubes} cubes"
         measured = _measure(processes, children, part, lambda data: None, progress, name)
-    return {"echo_cpu_percent": round(sum(measured.cpu_percent.values()), 1)}
+    return {"echo_cpu_percent": round(sum(measured.measure_cpu_percent.values()), 1)}
 
 
 def _measure(
@@ -377,7 +377,7 @@ def _measure(
         n_messages += 1
         receive(data)
 
-    with observing("bench", children) as observer:
+    with observe_skin("bench", children) as observer:
         observer.listen(SkinStress, "stress", on_stress, batch_profile(bench.rate))
         if receive_found is not None and bench.topic:
             kind, profile = FOUND[bench.topic], batch_profile(bench.rate)
@@ -395,9 +395,9 @@ def _measure(
         while (left_s := bench.duration - (time.monotonic() - start_s)) > 0:
             observer.spin(min(MEMORY_PERIOD_S, left_s))
             progress.update(task, completed=time.monotonic() - start_s)
-            for name, value in usage.memory_mb().items():
+            for name, value in usage.measure_memory_mb().items():
                 memory_mb[name].append(value)
-        end_ns, cpu_percent = time.time_ns(), usage.cpu_percent()
+        end_ns, cpu_percent = time.time_ns(), usage.measure_cpu_percent()
         observer.spin(DRAIN_S)
     progress.remove_task(task)
     return Measurement(start_ns, end_ns, cpu_percent, memory_mb, first_tensor_s)

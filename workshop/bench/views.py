@@ -21,7 +21,7 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from cube_tensor_driver.demo.demo import write_grid
-from cube_tensor_driver.demo.running import observing
+from cube_tensor_driver.demo.running import observe_skin
 from cube_tensor_driver.demo.usage import Usage
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.domain import own_domain
@@ -88,7 +88,7 @@ def measure(cubes: int) -> dict[str, float]:
         stack.enter_context(own_domain())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cube_views_")))
         children = stack.enter_context(Children(folder))
-        observer = stack.enter_context(observing("measure", children))
+        observer = stack.enter_context(observe_skin("measure", children))
         hubs = SimulatedHubs(folder / "ports", instants=INSTANTS)
         skin = write_grid(folder / "skin.yaml", cubes, RATE, CUBES_PER_HUB)
         for process in list_skin_processes(skin, markers=True, contacts=True, simulated=hubs):
@@ -100,8 +100,10 @@ def measure(cubes: int) -> dict[str, float]:
         observer.spin(SETTLE_S)
         usage = Usage(children, VIEWS)
         observer.spin(MEASURE_S)
-        figures = {f"cpu_{name}_percent": value for name, value in usage.cpu_percent().items()}
-        figures["rss_view_mb"] = usage.memory_mb()["view"]
+        figures = {
+            f"cpu_{name}_percent": value for name, value in usage.measure_cpu_percent().items()
+        }
+        figures["rss_view_mb"] = usage.measure_memory_mb()["view"]
         return {name: round(value, 1) for name, value in figures.items()}
 
 

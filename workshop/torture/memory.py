@@ -43,7 +43,7 @@ class MemoryMonitor:
         running = set(self._names).intersection(self._children.names())
         # A process that is being started again does not run for a moment.
         usage = Usage(self._children, running)
-        for name, size_mb in usage.memory_mb().items():
+        for name, size_mb in usage.measure_memory_mb().items():
             sizes = self._sizes.setdefault(self._children.find_pid(name), [])
             sizes.append((now_s, size_mb))
 

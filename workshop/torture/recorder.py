@@ -26,7 +26,7 @@ from rclpy.qos import QoSProfile
 from cube_tensor_driver.config.skin import Skin
 from cube_tensor_driver.core.errors import MessageError
 from cube_tensor_driver.core.rows import concatenate
-from cube_tensor_driver.demo.running import Observer, observing
+from cube_tensor_driver.demo.running import Observer, observe_skin
 from cube_tensor_driver.messages.codec import (
     AnyRows,
     MessageCodec,
@@ -308,7 +308,7 @@ def record_torture(
         for step in steps:
             step()
 
-    with observing("torture", children, interrupted=interrupted, on_step=on_step) as observer:
+    with observe_skin("torture", children, interrupted=interrupted, on_step=on_step) as observer:
         node = rclpy.create_node("checker")
         try:
             recorder = TortureRecorder(observer, node, skin)
