@@ -93,9 +93,9 @@ def find_refusal(
 class Gate:
     """Server, in a thread of its own, that passes accepted requests on to the server behind it.
 
-    It refuses a request for which `refusal` returns a reason, or which lacks a required token. The
-    server behind it must answer only one request per connection, as viser does, because the gate
-    checks only the first request of a connection.
+    It refuses a request for which `find_refusal` returns a reason, or which lacks a required token.
+    The server behind it must answer only one request per connection, as viser does, because the
+    gate checks only the first request of a connection.
 
     Attributes:
         port: TCP port on which the gate listens.

@@ -36,7 +36,7 @@ from ..msg import SkinContacts
 from ..processes.stop_signals import stop_event
 from ..ros.callbacks import CallbackErrors
 from ..ros.messages import to_ns
-from ..ros.session import describe_domain, node_session, spin_until
+from ..ros.session import describe_domain, run_node_session, spin_until
 from ..ros.skin_subscriber import FollowedSkin, SkinSubscriber
 from ..srv import Tare
 from . import markup
@@ -381,7 +381,7 @@ def run_view(
     """
     stop = stop_event()
     with (
-        node_session("view") as (node, executor),
+        run_node_session("view") as (node, executor),
         contextlib.closing(
             Viewer(
                 node,

@@ -100,7 +100,7 @@ class LoadVerification:
     """Collects the rows (one cube at one sampling time) of messages, and compares them with what
     was simulated: the samples that the hubs took in a period, and the load on the skin.
 
-    Call `set_sent_samples` when the simulator has ended, then `result` or `forces`.
+    Call `set_sent_samples` when the simulator has ended, then `make_result` or `forces`.
 
     Attributes:
         load: The load on the skin.
@@ -153,7 +153,7 @@ class LoadVerification:
         start_ns: int,
         end_ns: int,
     ) -> None:
-        """Set the sent samples with which `result` and `forces` compare the received rows.
+        """Set the sent samples with which `make_result` and `forces` compare the received rows.
 
         Args:
             log: Log of the simulator, which contains the samples that its hubs took.

@@ -21,7 +21,7 @@ from rclpy.qos import QoSProfile
 
 from ..core.errors import CubeError
 from ..processes.children import Children
-from ..ros.session import STEP_S, node_session, spin_until
+from ..ros.session import STEP_S, run_node_session, spin_until
 from ..simulation.sample_log import SampleLog
 
 
@@ -31,7 +31,7 @@ class Interrupted(CubeError):
 
 @dataclass
 class Observer:
-    """A ROS node that receives what the nodes in child processes publish; see `observing`.
+    """A ROS node that receives what the nodes in child processes publish; see `observe_skin`.
 
     Attributes:
         node: The ROS node.
@@ -129,7 +129,7 @@ def observe_skin(
         interrupted: Event that lets `Observer.spin` raise Interrupted; None: no such event.
         on_step: Function that `Observer.spin` calls repeatedly while it receives messages.
     """
-    with node_session(name) as (node, executor):
+    with run_node_session(name) as (node, executor):
         yield Observer(
             node,
             executor,

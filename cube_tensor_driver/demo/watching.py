@@ -21,8 +21,8 @@ from ..messages.codec import frequency_codec, stress_codec
 from ..msg import SkinFrequencies, SkinStress
 from ..processes.children import Children
 from ..ros.commands.services import ANNOUNCE_S
-from ..ros.qos import batch_profile
-from ..ros.session import describe_domain, node_session, spin_until
+from ..ros.qos import make_batch_profile
+from ..ros.session import describe_domain, run_node_session, spin_until
 from ..simulation.imperfections import read_imperfections
 from ..simulation.load import read_load
 from ..views.terminal.live_table import LiveTable
@@ -179,7 +179,7 @@ def check_no_skin() -> None:
     Raises:
         CubeError: A skin publishes.
     """
-    with node_session("demo") as (node, executor):
+    with run_node_session("demo") as (node, executor):
         if spin_until(executor, lambda: node.count_publishers("stress"), ANNOUNCE_S):
             raise make_other_skin_error()
 
@@ -222,7 +222,7 @@ class SkinWatcher:
         self._sees_other_skin = False
         self._made_s = time.monotonic()
         self._crc_errors: dict[str, int] = {}
-        profile = batch_profile(rate)
+        profile = make_batch_profile(rate)
         observer.listen(
             SkinStress,
             "stress",

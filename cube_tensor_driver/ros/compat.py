@@ -26,7 +26,7 @@ except ImportError:
 __all__ = [
     "SubscriptionEventCallbacks",
     "make_executor",
-    "with_number",
+    "wrap_with_number",
 ]
 
 
@@ -50,7 +50,7 @@ def make_executor(warn: Callable[[str], object] = lambda text: None) -> Executor
     return EventsExecutor()
 
 
-def with_number(callback: Callable[[Any, int | None], None]) -> Callable[..., None]:
+def wrap_with_number(callback: Callable[[Any, int | None], None]) -> Callable[..., None]:
     """Wrap a function that takes a message and its sequence number, as callback of a subscription.
 
     Args:

@@ -62,8 +62,8 @@ def make_motion_source(
     Raises:
         ConfigError: Both parameters are set.
     """
-    topic = str(node.value("imu"))
-    frame = str(node.value("gravity"))
+    topic = str(node.read_value("imu"))
+    frame = str(node.read_value("gravity"))
     if topic and frame:
         raise ConfigError(f"parameters imu ({topic}) and gravity ({frame}): set only one of them")
     if topic:
@@ -86,7 +86,7 @@ class Transforms:
         listener = tf2_ros.TransformListener(self._buffer, node)
         node.call_at_cleanup(listener.unregister)
 
-    def newest(
+    def find_newest(
         self,
         target: str,
         source: str,
@@ -149,12 +149,12 @@ class GravityMotion:
         self._parent_frame = parent_frame
         self._transforms = Transforms(node)
 
-    def motion(self, first_ns: int, last_ns: int) -> Motion:
+    def compute_motion(self, first_ns: int, last_ns: int) -> Motion:
         """Return the motion at the end of a span of time, computed from the newest transform of TF.
 
-        Arguments and errors are those of `ImuMotion.motion`.
+        Arguments and errors are those of `ImuMotion.compute_motion`.
         """
-        rotation, _, time_ns = self._transforms.newest(self._parent_frame, self._frame)
+        rotation, _, time_ns = self._transforms.find_newest(self._parent_frame, self._frame)
         age_ns = last_ns - time_ns
         if time_ns and abs(age_ns) > MAX_TRANSFORM_AGE_NS:
             side = "older" if age_ns > 0 else "newer"
@@ -226,8 +226,8 @@ class ImuMotion:
         self._topic = topic
         self._parent_frame = parent_frame
         self._transforms = Transforms(node)
-        # `motion` may read the list in another thread. So samples are only ever appended to it, and
-        # it is replaced by another list to drop some.
+        # `compute_motion` may read the list in another thread. So samples are only ever
+        # appended to it, and it is replaced by another list to drop some.
         self._samples: list[_Sample] = []
         self._imu_frame = parent_frame
         # Result of `_find_mounting`; frame of the IMU, and time at which the transform was read.
@@ -246,10 +246,10 @@ class ImuMotion:
         )
 
     def on_imu(self, data: bytes) -> None:
-        """Store a serialised message of the IMU, which `motion` uses.
+        """Store a serialised message of the IMU, which `compute_motion` uses.
 
         A message that cannot be used is ignored; the reason is stored as the text of the error that
-        `motion` raises.
+        `compute_motion` raises.
         """
         try:
             time_ns, force, velocity, self._imu_frame = _decode(data)
@@ -281,7 +281,7 @@ class ImuMotion:
         motion = force + _find_gradient(velocity, acceleration)
         self._samples.append(_Sample(time_ns, velocity, mean, motion))
 
-    def motion(self, first_ns: int, last_ns: int) -> Motion:
+    def compute_motion(self, first_ns: int, last_ns: int) -> Motion:
         """Return the motion at the times of the IMU's samples before, in and after a span of time.
 
         The caller interpolates between these times.
@@ -332,7 +332,7 @@ class ImuMotion:
         frame, read_ns = self._mounted
         if frame != self._imu_frame or abs(now_ns - read_ns) > MOUNTING_PERIOD_NS:
             frame = self._imu_frame
-            rotation, position, _ = self._transforms.newest(self._parent_frame, frame)
+            rotation, position, _ = self._transforms.find_newest(self._parent_frame, frame)
             of_gradient = np.kron(rotation, rotation)
             lever = -np.kron(np.eye(3), position) @ of_gradient
             self._mounting = np.zeros((12, 12))

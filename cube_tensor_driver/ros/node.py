@@ -40,7 +40,7 @@ from ..core.errors import ConfigError, CubeError
 from ..processes.stop_signals import stop_event
 from .callbacks import Callback, CallbackErrors, guard, shorten
 from .compat import make_executor
-from .qos import SERVICES, batch_profile, scans_per_message
+from .qos import SERVICES, count_scans_per_message, make_batch_profile
 from .session import spin_until, start_ros
 
 MAX_BUFFERS = 4
@@ -130,7 +130,7 @@ class CubeNode(LifecycleNode):
         It is called only while the node is configured.
 
         Args:
-            name: Name of the parameter; `value` returns its new value.
+            name: Name of the parameter; `read_value` returns its new value.
         """
 
     @property
@@ -173,7 +173,7 @@ class CubeNode(LifecycleNode):
         """
         self._resources.callback(function)
 
-    def value(self, name: str) -> Any:
+    def read_value(self, name: str) -> Any:
         """Return the present value of a parameter of the node."""
         return self.get_parameter(name).value
 
@@ -183,19 +183,19 @@ class CubeNode(LifecycleNode):
         Raises:
             ConfigError: The parameter `config` is empty, or the file has a mistake.
         """
-        return read_skin(self.config(), self.value("frame_prefix"))
+        return read_skin(self.find_config(), self.read_value("frame_prefix"))
 
-    def config(self) -> Path:
+    def find_config(self) -> Path:
         """Return the path in the parameter `config`.
 
         Raises:
             ConfigError: The parameter is empty.
         """
-        if not self.value("config"):
+        if not self.read_value("config"):
             raise ConfigError("parameter config is empty: name a skin file, -p config:=skin.yaml")
-        return Path(self.value("config")).expanduser()
+        return Path(self.read_value("config")).expanduser()
 
-    def batch_profile(self, rate_hz: float | None, n_cubes: int) -> QoSProfile:
+    def make_batch_profile(self, rate_hz: float | None, n_cubes: int) -> QoSProfile:
         """Return the quality of service of the topics `frequencies`, `stress` and `forces`.
 
         It depends on the parameters `publish_period` and `qos_reliability` of the node.
@@ -204,9 +204,9 @@ class CubeNode(LifecycleNode):
             rate_hz: Sampling rate of each cube, in Hz; None: not known.
             n_cubes: Number of cubes of the skin.
         """
-        scans = scans_per_message(self.value("publish_period"), rate_hz)
+        scans = count_scans_per_message(self.read_value("publish_period"), rate_hz)
         message_rate = None if rate_hz is None else rate_hz / scans
-        return batch_profile(message_rate, self.value("qos_reliability"), scans * n_cubes)
+        return make_batch_profile(message_rate, self.read_value("qos_reliability"), scans * n_cubes)
 
     # These methods of rclpy register callbacks. They are overridden to catch exceptions in them.
 
@@ -462,7 +462,7 @@ def _run_nodes(nodes: Sequence[CubeNode], stopping: threading.Event) -> int:
     code = 0
     for node in nodes:
         executor.add_node(node)
-        must_start = not stopping.is_set() and node.value("autostart")
+        must_start = not stopping.is_set() and node.read_value("autostart")
         if must_start and not _start(node):
             code = os.EX_CONFIG if node.is_misconfigured else 1
             stopping.set()

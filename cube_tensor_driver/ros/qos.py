@@ -61,7 +61,7 @@ parameter services of rclpy have a depth of 1000, too.
 """
 
 
-def batch_profile(
+def make_batch_profile(
     rate_hz: float | None,
     reliability: str = "reliable",
     rows: int = 1,
@@ -82,7 +82,7 @@ def batch_profile(
     return QoSProfile(depth=depth, reliability=policy)
 
 
-def scans_per_message(publish_period_s: float, rate_hz: float | None) -> int:
+def count_scans_per_message(publish_period_s: float, rate_hz: float | None) -> int:
     """Return the number of scans (samples of all cubes) that one message holds, at least one.
 
     Args:

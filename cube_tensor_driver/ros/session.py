@@ -52,7 +52,7 @@ class NodeSession(NamedTuple):
 
 
 @contextmanager
-def node_session(name: str) -> Iterator[NodeSession]:
+def run_node_session(name: str) -> Iterator[NodeSession]:
     """Start rclpy with a node for a `with` block, and shut rclpy down at its end.
 
     Args:

@@ -194,7 +194,7 @@ class SkinSubscriberNode(CubeNode):
 
     def configure(self) -> None:
         is_followed = type(self).follow_stress is not SkinSubscriberNode.follow_stress
-        period_s = 1.0 / self.value("rate")
+        period_s = 1.0 / self.read_value("rate")
         due_s = 0.0
 
         def receive(stamp_ns: int, rows: StressRows) -> None:

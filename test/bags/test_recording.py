@@ -41,7 +41,7 @@ from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, list_skin_processes
 from cube_tensor_driver.ros.messages import to_ns
-from cube_tensor_driver.ros.qos import batch_profile
+from cube_tensor_driver.ros.qos import make_batch_profile
 from cube_tensor_driver.simulation.inject import inject
 
 SKIN = find_package_data() / "config" / "skin_demo.yaml"
@@ -261,7 +261,7 @@ def test_the_duration_of_a_recording_begins_with_its_first_message(tmp_path, mon
     bag = SimpleNamespace(folder=tmp_path, messages=1)
     node = SimpleNamespace(create_timer=lambda *_: None)
     its_node = session.NodeSession(node, SimpleNamespace(spin_once=spin_once))
-    monkeypatch.setattr(record, "node_session", lambda _: contextlib.nullcontext(its_node))
+    monkeypatch.setattr(record, "run_node_session", lambda _: contextlib.nullcontext(its_node))
     monkeypatch.setattr(record, "stop_event", threading.Event)
     monkeypatch.setattr(record, "BagWriter", lambda *_: bag)
     limits = {"storage": "mcap", "max_bytes": 0, "max_seconds": 0.0}
@@ -456,7 +456,7 @@ def test_replayed_frequencies_give_the_recorded_stress(ros, tmp_path, config, co
     """
     made = {"left_out": stuck, "tare": (90, 1.001)} if config == "bag" else {}
     path = make_bag(tmp_path / "bag", SKIN, 150, **made)
-    batches = ros.listen(SkinStress, "stress", batch_profile(None))
+    batches = ros.listen(SkinStress, "stress", make_batch_profile(None))
     infos = ros.listen(SkinInfo, "info", LATCHED)
     clock = ros.listen(
         Clock, "/clock", QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -494,7 +494,7 @@ def test_replayed_frequencies_give_the_recorded_stress(ros, tmp_path, config, co
 def test_replay_starts_late_pauses_steps_and_quits(ros, tmp_path):
     """Keys through a terminal of its own."""
     path = make_bag(tmp_path / "bag", SKIN, 300)
-    raw = ros.listen(SkinFrequencies, "frequencies", batch_profile(None))
+    raw = ros.listen(SkinFrequencies, "frequencies", make_batch_profile(None))
     infos = ros.listen(SkinInfo, "info", LATCHED)
     near, far = pty.openpty()
     player = subprocess.Popen(

@@ -409,8 +409,8 @@ def test_a_line_says_when_a_cube_breaks_and_when_it_is_fine_again():
         *[lambda frequency, row: None] * 3,
     ):
         skin.play(2 * WINDOW_S, harm)
-        summaries.append(words.summary())
-        now, lines = words.statuses({2: 0xC2})
+        summaries.append(words.count_faults())
+        now, lines = words.make_statuses({2: 0xC2})
         said.append(lines)
         statuses.append([(one.level, one.hardware_id, one.values) for one in now])
     rows = [KeyValue(key="rows since the last", value=str(round(2 * WINDOW_S * 1e9 / PERIOD_NS)))]
@@ -431,12 +431,12 @@ def test_a_cube_with_a_residual_is_a_warning_and_counted():
         read_skin(find_package_data() / "config" / "skin_demo.yaml"), skin.reconstructor
     )
     skin.play(2)
-    words.statuses({})
+    words.make_statuses({})
     skin.play(3, lambda frequency, row: frequency[2].__setitem__(5, 1.01 * frequency[2, 5]))
-    (status,), _ = words.statuses({})
+    (status,), _ = words.make_statuses({})
     assert (status.name, status.level) == ("cube c02", b"\1")
     assert status.message.startswith("residual above its level")
-    assert words.summary() == {"cubes with a residual": 1}
+    assert words.count_faults() == {"cubes with a residual": 1}
 
 
 def test_a_start_is_quiet_and_a_cube_that_stays_away_is_not():
@@ -454,9 +454,9 @@ def test_a_start_is_quiet_and_a_cube_that_stays_away_is_not():
         rows = np.arange(cubes)
         stamps = np.full(cubes, number * 1_000_000_000)
         reconstructor(stamped(rows, rest[:cubes], np.zeros(cubes, np.uint32), stamps))
-        return words.statuses({})[1]
+        return words.make_statuses({})[1]
 
-    statuses, lines = words.statuses({})
+    statuses, lines = words.make_statuses({})
     assert len(statuses) == n and all("missing" in one.message for one in statuses)
     assert not lines
     for number in range(2, MIN_UPDATES_TO_LOG + 1):

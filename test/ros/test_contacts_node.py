@@ -177,11 +177,13 @@ def test_a_node_that_cannot_get_ready_says_so_and_tries_again(monkeypatch):
         until = time.monotonic() + 10
         while node._take_finder() is None:
             assert time.monotonic() < until
-            said += [status.message for status in node._statuses() if status.message not in said]
+            said += [
+                status.message for status in node._make_statuses() if status.message not in said
+            ]
             wait([node._future_finder], timeout=10)
     assert said == ["no contacts: a.npz: damaged; make it again", "no contacts: MemoryError"]
     assert logged == ["a.npz: damaged; make it again", "MemoryError"]
-    assert node._take_finder() == "finder" and node._statuses() == []
+    assert node._take_finder() == "finder" and node._make_statuses() == []
 
 
 def test_contacts_and_traction_of_a_pressed_skin_live_and_out_of_a_bag(ros, tmp_path):

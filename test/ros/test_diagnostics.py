@@ -41,7 +41,7 @@ from cube_tensor_driver.processes.skin_processes import RECORDED, list_skin_proc
 from cube_tensor_driver.ros.callbacks import CallbackErrors
 from cube_tensor_driver.ros.commands import record
 from cube_tensor_driver.ros.commands.echo import resolve_topics
-from cube_tensor_driver.ros.compat import make_executor, with_number
+from cube_tensor_driver.ros.compat import make_executor, wrap_with_number
 from cube_tensor_driver.ros.diagnostics.links import LinkDiagnostics
 from cube_tensor_driver.ros.diagnostics.reconstruction import (
     LostMessages,
@@ -70,7 +70,7 @@ def test_what_a_late_subscriber_loses_is_counted(ros, executor):
 
     node = rclpy.create_node("late")
     node.create_subscription(
-        UInt32, "late", with_number(take), DEPTH, event_callbacks=lost.new_subscription()
+        UInt32, "late", wrap_with_number(take), DEPTH, event_callbacks=lost.begin_subscription()
     )
     spinner = executor()
     spinner.add_node(node)
@@ -114,7 +114,7 @@ def test_a_publisher_that_begins_again_is_no_loss():
     for number in (5, 6, 7, 1, 2, 3, 6, 7, 8, 11, 12):
         lost.note_arrival(number)
     assert lost.count == 4
-    events = lost.new_subscription()
+    events = lost.begin_subscription()
     for number in (40, 41, 44, 45):
         lost.note_arrival(number)
     assert lost.count == 6
@@ -125,7 +125,7 @@ def test_a_publisher_that_begins_again_is_no_loss():
 
 def test_each_count_of_the_reconstruction_is_in_its_pair():
     lost = LostMessages()
-    tare = SimpleNamespace(uids={}, age=lambda: {"cubes tared": "4"})
+    tare = SimpleNamespace(uids={}, describe_age=lambda: {"cubes tared": "4"})
     diagnostics = ReconstructionDiagnostics(SKIN, Reconstructor(SKIN), tare, lost)
 
     def step(numbers, status):
@@ -135,7 +135,7 @@ def test_each_count_of_the_reconstruction_is_in_its_pair():
         diagnostics.count(
             StressRows.of(np.arange(len(status)), blank[:, :6], blank, status=np.array(status))
         )
-        (rows,) = diagnostics.statuses(False)[0]
+        (rows,) = diagnostics.make_statuses(False)[0]
         return (rows.level, rows.message.partition("; ")[2]), pairs(rows)
 
     def expected(rows, rows_per_second, invalid_rows, lost, refused):
@@ -175,7 +175,7 @@ def test_each_count_of_the_driver_is_in_its_pair():
     diagnostics = LinkDiagnostics("skin")
 
     def report():
-        (rows,) = diagnostics.statuses(links, with_links=False)
+        (rows,) = diagnostics.make_statuses(links, with_links=False)
         return (rows.level, rows.message), pairs(rows)
 
     said, values = report()
@@ -230,7 +230,7 @@ def test_errors_of_callbacks_are_counted_in_the_first_status():
 
 def test_an_inactive_node_says_so_and_blames_no_cube():
     reconstructor = Reconstructor(SKIN)
-    tare = SimpleNamespace(uids={}, age=dict)
+    tare = SimpleNamespace(uids={}, describe_age=dict)
     diagnostics = ReconstructionDiagnostics(SKIN, reconstructor, tare, LostMessages())
     rest = np.array([cube.calibration.rest_frequency for cube in SKIN.cubes])
 
@@ -239,7 +239,7 @@ def test_an_inactive_node_says_so_and_blames_no_cube():
             cubes = np.arange(len(SKIN.cubes))
             stamps = np.full(len(cubes), second * 1_000_000_000)
             reconstructor(FrequencyRows.of(cubes, rest.astype(np.float32), stamp_ns=stamps))
-        statuses, changes = diagnostics.statuses(active)
+        statuses, changes = diagnostics.make_statuses(active)
         assert not changes
         return [status.message for status in statuses]
 
@@ -265,7 +265,7 @@ def test_losses_of_a_link_are_a_warning_and_coloured_on_the_page(states, notes, 
     state, *past_states = states
     report = LinkReport("hub0", 0xAB, state, tuple(past_states), notes, {"lost_on_the_way": 5})
     links = SimpleNamespace(count_rows=RowCounts, report=lambda: [report])
-    rows, link = LinkDiagnostics("skin").statuses(links, with_links=True)
+    rows, link = LinkDiagnostics("skin").make_statuses(links, with_links=True)
     assert (rows.level, link.level) == (b"\0", level)
     assert (link.name, link.hardware_id) == ("link hub0", "0xab")
     assert pairs(link) == {"lost_on_the_way": "5"}

@@ -422,7 +422,7 @@ def test_a_missing_imu_is_one_line_and_the_node_goes_on(start, monkeypatch, case
     assert (stress_codec.decode(stress).rows.status & COMPENSATION).all()
     (motion,) = decode_compensation(node)
     assert motion.weight and not len(motion.time_offset)
-    status = node._statuses()[0]
+    status = node._make_statuses()[0]
     assert text in status.message and "weight is not compensated" in status.message
     assert "\n" not in status.message and status.level != b"\0"
 
@@ -452,11 +452,11 @@ def test_gravity_comes_from_tf_alone(start, monkeypatch):
     known, old = decode_compensation(node)
     np.testing.assert_allclose(known.specific_force, turned[:, 2] * G)
     assert not len(old.time_offset)
-    assert "transform from world to tool is 1.4 s older" in node._statuses()[0].message
+    assert "transform from world to tool is 1.4 s older" in node._make_statuses()[0].message
     stress = [stress_codec.decode(one).rows for one in node.sent["stress"]]
     assert [rows.status[0] & (WEIGHT | COMPENSATION) for rows in stress] == [WEIGHT, COMPENSATION]
     node.on_rows(scan_at(-49.9))
-    assert "transform from world to tool is 50.0 s newer" in node._statuses()[0].message
+    assert "transform from world to tool is 50.0 s newer" in node._make_statuses()[0].message
 
 
 def test_what_nobody_records_is_not_sent_but_compensated(start, monkeypatch):

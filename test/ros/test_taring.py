@@ -125,8 +125,8 @@ def test_a_tare_that_was_taken_before_the_uid_was_known_stays_and_is_kept(skin):
 def test_tared_cubes_are_counted_and_the_oldest_tare_gives_the_age(skin):
     now = datetime.now(timezone.utc)
     skin.tares.created = {0: None}
-    assert skin.tares.age() == {"cubes tared": "0"}
+    assert skin.tares.describe_age() == {"cubes tared": "0"}
     skin.tares.created |= {number: now - timedelta(hours=number) for number in (1, 3, 2)}
-    age = skin.tares.age()
+    age = skin.tares.describe_age()
     assert age.keys() == {"cubes tared", "oldest tare s"} and age["cubes tared"] == "3"
     assert int(age["oldest tare s"]) == pytest.approx(3 * 3600, abs=60)

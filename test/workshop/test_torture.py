@@ -92,7 +92,7 @@ def test_a_mutated_module_is_the_one_that_others_import():
         "import_mutated(MUTATIONS['losses unseen'].edits)\n"
         "from cube_tensor_driver.ros import node, qos\n"
         "from cube_tensor_driver.ros.diagnostics.reconstruction import LostMessages\n"
-        "assert qos.batch_profile(1000.0).depth == 100\n"
+        "assert qos.make_batch_profile(1000.0).depth == 100\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 

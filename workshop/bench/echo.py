@@ -18,7 +18,7 @@ from cube_tensor_driver.config.parameters import AUTOSTART, Parameter
 from cube_tensor_driver.msg import SkinFrequencies, SkinStress
 from cube_tensor_driver.ros.messages import pack_array
 from cube_tensor_driver.ros.node import CubeNode, run
-from cube_tensor_driver.ros.qos import batch_profile
+from cube_tensor_driver.ros.qos import make_batch_profile
 
 STRESSES = 6
 """Number of stresses in a row of stress."""
@@ -43,14 +43,14 @@ class BareSource(CubeNode):
 
     def configure(self) -> None:
         """Make the publisher, and the constant arrays of all messages."""
-        n = int(self.value("cubes"))
-        rate = float(self.value("rate"))
+        n = int(self.read_value("cubes"))
+        rate = float(self.read_value("rate"))
         self._publisher: Any = self.create_lifecycle_publisher(  # type: ignore[no-untyped-call]
-            SkinFrequencies, "frequencies", batch_profile(rate)
+            SkinFrequencies, "frequencies", make_batch_profile(rate)
         )
         self._cube = np.arange(n, dtype=np.uint16)
         self._zeros = np.zeros(n, np.uint32)
-        self._frequency = np.full((n, int(self.value("pads"))), 1e5, np.float32)
+        self._frequency = np.full((n, int(self.read_value("pads"))), 1e5, np.float32)
         self._temperature = np.full(n, np.nan, np.float32)
         self._timer = self.create_timer(1.0 / rate, self._publish)
 
@@ -77,8 +77,8 @@ class BareEcho(CubeNode):
 
     def configure(self) -> None:
         """Subscribe to `frequencies`, and make the constant arrays of all answers."""
-        n = int(self.value("cubes"))
-        quality = batch_profile(float(self.value("rate")))
+        n = int(self.read_value("cubes"))
+        quality = make_batch_profile(float(self.read_value("rate")))
         self._publisher: Any = self.create_lifecycle_publisher(  # type: ignore[no-untyped-call]
             SkinStress, "stress", quality
         )

@@ -34,7 +34,7 @@ from cube_tensor_driver.msg import SkinContacts, SkinStress, SkinTouch
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.domain import own_domain
 from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, list_skin_processes
-from cube_tensor_driver.ros.qos import batch_profile
+from cube_tensor_driver.ros.qos import make_batch_profile
 from cube_tensor_driver.simulation.sample_log import SampleLog, SampleTable
 from cube_tensor_driver.views.figures.style import save
 
@@ -234,7 +234,7 @@ def _measure_skin(
     # Only rows of the first cube of each hub were stored, because storing all would delay this
     # process. They are counted for all cubes of the hub.
     comparison = compare(taken, arrivals, measured.start_ns, measured.end_ns)
-    cpu = measured.measure_cpu_percent
+    cpu = measured.cpu_percent
     seconds = 1e-9 * (measured.end_ns - measured.start_ns)
     return {
         "samples_expected": round(bench.rate * seconds) * load.cubes,
@@ -245,7 +245,7 @@ def _measure_skin(
         "latency_p50_ms": percentile(comparison.latency_ms, 50),
         "latency_p99_ms": percentile(comparison.latency_ms, 99),
         **{f"cpu_{name}_percent": round(value, 1) for name, value in cpu.items()},
-        **summarise_memory(measured.measure_memory_mb),
+        **summarise_memory(measured.memory_mb),
         "first_tensor_s": round(measured.first_tensor_s, 2),
         **(_summarise_found(bench, np.array(found), taken, measured) if bench.topic else {}),
     }
@@ -335,7 +335,7 @@ def _measure_echo(
         part = replace(bench, duration=min(bench.duration / 2, MAX_ECHO_S))
         name = f"echo of {cubes} cubes"
         measured = _measure(processes, children, part, lambda data: None, progress, name)
-    return {"echo_cpu_percent": round(sum(measured.measure_cpu_percent.values()), 1)}
+    return {"echo_cpu_percent": round(sum(measured.cpu_percent.values()), 1)}
 
 
 def _measure(
@@ -378,9 +378,9 @@ def _measure(
         receive(data)
 
     with observe_skin("bench", children) as observer:
-        observer.listen(SkinStress, "stress", on_stress, batch_profile(bench.rate))
+        observer.listen(SkinStress, "stress", on_stress, make_batch_profile(bench.rate))
         if receive_found is not None and bench.topic:
-            kind, profile = FOUND[bench.topic], batch_profile(bench.rate)
+            kind, profile = FOUND[bench.topic], make_batch_profile(bench.rate)
             observer.listen(kind, bench.topic, receive_found, profile)
         observer.spin(MAX_START_S, lambda: n_messages > 0)
         if not n_messages:

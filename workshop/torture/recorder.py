@@ -36,7 +36,7 @@ from cube_tensor_driver.messages.codec import (
 from cube_tensor_driver.msg import SkinFrequencies, SkinStress
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.ros.messages import to_ns
-from cube_tensor_driver.ros.qos import batch_profile
+from cube_tensor_driver.ros.qos import make_batch_profile
 
 from ..checks.record import NodeAction, Received, Record, Span
 from .memory import MemoryMonitor
@@ -204,7 +204,7 @@ class TortureRecorder:
             skin: The skin.
         """
         self.observer, self._skin = observer, skin
-        quality = batch_profile(RATE)
+        quality = make_batch_profile(RATE)
         quality.depth = QUEUE_DEPTH
         self._frequencies = TopicLog(
             node, SkinFrequencies, "frequencies", quality, frequency_codec, skin

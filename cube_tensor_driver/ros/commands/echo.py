@@ -21,7 +21,7 @@ from ...msg import SkinInfo, SkinStress, StressTensorStamped
 from ...processes.stop_signals import stop_event
 from ..messages import find_message_class, log_refused_message, to_ns
 from ..qos import LATCHED, match_offered_profile
-from ..session import describe_domain, node_session, spin_until
+from ..session import describe_domain, run_node_session, spin_until
 from .services import discover
 
 QUEUE_DEPTH = 100
@@ -79,7 +79,7 @@ def listen(topic: str, once: bool) -> Iterator[list[Item]]:
             `once` no message came within `MAX_MESSAGE_S`.
     """
     stop = stop_event()
-    with node_session("echo") as (node, executor):
+    with run_node_session("echo") as (node, executor):
         name = resolve_topics(node, [topic])[0]
         listener = _Listener(node, name)
 

@@ -26,7 +26,7 @@ from ...core.errors import BagError
 from ...processes.stop_signals import stop_event
 from ..messages import find_message_class
 from ..qos import match_offered_profile
-from ..session import describe_domain, node_session, spin_until
+from ..session import describe_domain, run_node_session, spin_until
 from .echo import resolve_topics
 
 QUEUE_DEPTH = 2000
@@ -281,7 +281,7 @@ def record(
         ConfigError: ROS does not allow the name of a topic, or rclpy does not start.
     """
     stop = stop_event()
-    with node_session("recorder") as session:
+    with run_node_session("recorder") as session:
         names = resolve_topics(session.node, topics)
         bag = BagWriter(
             folder,

@@ -26,7 +26,7 @@ from ...processes.stop_signals import on_stop_signal
 from ...srv import SteerReplay
 from ..messages import find_message_class, to_time
 from ..qos import NEWEST, make_profile
-from ..session import node_session, spin_until
+from ..session import run_node_session, spin_until
 
 QUEUE_DEPTH = 2000
 """Depth of the queue of each replayed topic, in messages."""
@@ -426,7 +426,7 @@ def replay(
     Raises:
         BagError: The bag cannot be read, or has no topic to publish.
     """
-    with node_session("player") as (node, executor):
+    with run_node_session("player") as (node, executor):
         player = Player(
             node,
             bag,

@@ -21,7 +21,7 @@ from std_srvs.srv import Trigger
 
 from ...core.errors import ConfigError, CubeError, TareError
 from ...srv import Tare
-from ..session import NodeSession, describe_domain, node_session, spin_until
+from ..session import NodeSession, describe_domain, run_node_session, spin_until
 
 MAX_DISCOVERY_S = 5.0
 """Maximum time, in seconds, to search for topics and services of other nodes."""
@@ -84,7 +84,7 @@ def request_tare(cubes: Sequence[str], clear: bool) -> list[TareAnswer]:
     Raises:
         CubeError: No reconstruction node runs, or one has not responded within `MAX_ANSWER_S`.
     """
-    with node_session("tare_request") as session:
+    with run_node_session("tare_request") as session:
         services = find_services(session, "cube_tensor_driver/srv/Tare")
         if not services:
             raise TareError(
@@ -115,7 +115,7 @@ def list_nodes() -> list[str]:
     Raises:
         ConfigError: No such node was found within `MAX_DISCOVERY_S`.
     """
-    with node_session("parameters") as session:
+    with run_node_session("parameters") as session:
         spin_until(session.executor, lambda: False, ANNOUNCE_S)
         return _find_nodes(session)
 
@@ -133,7 +133,7 @@ def read_parameters(name: str, parameter: str | None) -> dict[str, Any]:
     Raises:
         ConfigError: There is no such node or parameter.
     """
-    with node_session("parameters") as session:
+    with run_node_session("parameters") as session:
         parameters = _NodeParameters(session, name)
         names = parameters.names()
         if parameter is not None:
@@ -156,7 +156,7 @@ def set_parameter(name: str, parameter: str, text: str) -> Any:
     Raises:
         ConfigError: There is no such node or parameter, or the node refuses the value.
     """
-    with node_session("parameters") as session:
+    with run_node_session("parameters") as session:
         parameters = _NodeParameters(session, name)
         parameters.check_name(parameter)
         parameters.set(parameter, text)

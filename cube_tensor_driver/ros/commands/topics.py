@@ -15,7 +15,7 @@ from rclpy.subscription import Subscription
 from ...core.errors import BagError, CubeError
 from ..messages import find_message_class
 from ..qos import match_offered_profile
-from ..session import NodeSession, describe_domain, node_session, spin_until
+from ..session import NodeSession, describe_domain, run_node_session, spin_until
 from .echo import QUEUE_DEPTH
 from .services import SETTLE_S, discover
 
@@ -69,7 +69,7 @@ def list_topics() -> list[ListedTopic]:
     Raises:
         CubeError: No topic was found.
     """
-    with node_session("topic_list") as session:
+    with run_node_session("topic_list") as session:
         node, executor = session
         if not discover(executor, lambda: _find_topics(node)):
             raise CubeError(f"nobody publishes in {describe_domain()}; start ./cube demo or a skin")

@@ -86,7 +86,7 @@ class ReconstructionDiagnostics:
         self._rows += len(rows)
         self._invalid_rows += int(np.count_nonzero(rows.status & INVALID))
 
-    def statuses(self, is_active: bool) -> tuple[list[DiagnosticStatus], LogChanges]:
+    def make_statuses(self, is_active: bool) -> tuple[list[DiagnosticStatus], LogChanges]:
         """Return the statuses for /diagnostics, and lines for the log about changes.
 
         The first status is about all rows (samples of cubes). The others are about cubes that have
@@ -100,7 +100,7 @@ class ReconstructionDiagnostics:
         cubes: list[DiagnosticStatus] = []
         changes: LogChanges = []
         if is_active and not self._was_inactive:
-            cubes, changes = self._cubes.statuses(self._tare.uids)
+            cubes, changes = self._cubes.make_statuses(self._tare.uids)
         else:
             # The node was inactive at times since the previous call. Rows that are missing in this
             # time are no fault of the cubes.
@@ -114,8 +114,8 @@ class ReconstructionDiagnostics:
             "invalid rows": self._invalid_rows,
             "messages lost on the way": self._lost.count,
             "messages that contradict themselves": self.refused_messages,
-            **self._tare.age(),
-            **self._cubes.summary(),
+            **self._tare.describe_age(),
+            **self._cubes.count_faults(),
         }
         self._rows_before = self._rows
         self._lost_before = self._lost.count
@@ -158,7 +158,7 @@ class CubeHealth:
         self._logged: dict[int, str] = {}
         self._updates = 0
 
-    def statuses(self, uids: Mapping[int, int]) -> tuple[list[DiagnosticStatus], LogChanges]:
+    def make_statuses(self, uids: Mapping[int, int]) -> tuple[list[DiagnosticStatus], LogChanges]:
         """Return the statuses of cubes with a fault now or at the previous call, and log lines.
 
         Args:
@@ -205,10 +205,10 @@ class CubeHealth:
         return statuses, changes
 
     def discard(self) -> None:
-        """Discard the faults that `Health` has found since the previous call of `statuses`."""
+        """Discard the faults that `Health` has found since the previous call of `make_statuses`."""
         self._health.collect()
 
-    def summary(self) -> dict[str, int]:
+    def count_faults(self) -> dict[str, int]:
         """Return the numbers of pads in each faulty condition, and of cubes with a high residual.
 
         Conditions are open, short, noisy and so on. The keys of the dict are the keys of the
@@ -312,7 +312,7 @@ class LostMessages:
         """Number of messages lost so far, in all subscriptions since the node was made."""
         return self._lost_earlier + max(self._lost_by_number, self._lost_by_dds)
 
-    def new_subscription(self) -> SubscriptionEventCallbacks:
+    def begin_subscription(self) -> SubscriptionEventCallbacks:
         """Begin to count for a new subscription.
 
         Returns:

@@ -47,7 +47,7 @@ class Diagnostics:
             statuses: Returns the statuses to publish. If the list is empty, nothing is published.
         """
         self._node = node
-        self._statuses = statuses
+        self._make_statuses = statuses
         self._errors_before = 0
         # In a node without a namespace both names resolve to the same topic, which then gets only
         # one publisher.
@@ -58,7 +58,7 @@ class Diagnostics:
         node.create_timer(PERIOD_S, self._publish)
 
     def _publish(self) -> None:
-        statuses = self._statuses()
+        statuses = self._make_statuses()
         if not statuses:
             return
         self._add_errors(statuses[0])

@@ -102,7 +102,7 @@ class Canvas:
         self._has_crosses = crosses
         self._health: Index | None = None
         self._plates = _make_plates(poses)
-        self._legend_place = LegendPlace.beside(poses)
+        self._legend_place = LegendPlace.place_beside(poses)
 
     def draw(
         self,

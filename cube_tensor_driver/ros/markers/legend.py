@@ -129,7 +129,7 @@ class LegendPlace(NamedTuple):
     z: float
 
     @classmethod
-    def beside(cls, poses: CubePoses) -> LegendPlace:
+    def place_beside(cls, poses: CubePoses) -> LegendPlace:
         """Return the position and size of the legend of a skin whose cubes have these poses."""
         low = poses.position.min(axis=0)
         high = poses.position.max(axis=0)

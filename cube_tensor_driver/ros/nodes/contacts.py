@@ -61,7 +61,7 @@ class Contacts(SkinSubscriberNode):
         self._future_finder: Future[ContactFinder] | None = None
         self._problem = ""
         self._touch = b""
-        self._updater = Diagnostics(self, self._statuses)
+        self._updater = Diagnostics(self, self._make_statuses)
 
     def configure(self) -> None:
         self._traction = self.own(self.create_lifecycle_publisher(PointCloud2, "traction", 2))
@@ -79,7 +79,7 @@ class Contacts(SkinSubscriberNode):
     def prepare(self, skin: FollowedSkin) -> None:
         # For each field of ContactSettings the node has a parameter of the same name.
         names = [field.name for field in fields(ContactSettings)]
-        settings = ContactSettings(**{name: self.value(name) for name in names})
+        settings = ContactSettings(**{name: self.read_value(name) for name in names})
         self._finder = None
         self._set_up = partial(
             contact_finder,
@@ -197,7 +197,7 @@ class Contacts(SkinSubscriberNode):
             self._future_finder = self._worker.submit(self._set_up)
         return self._finder
 
-    def _statuses(self) -> list[DiagnosticStatus]:
+    def _make_statuses(self) -> list[DiagnosticStatus]:
         """Return one diagnostic status with the reason why no contacts are computed; an empty list
         if contacts are computed."""
         if self._take_finder() is not None or not self._problem:

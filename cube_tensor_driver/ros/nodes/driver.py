@@ -26,7 +26,7 @@ from ..node import (
     NodeClock,
     run,
 )
-from ..qos import LATCHED, scans_per_message
+from ..qos import LATCHED, count_scans_per_message
 
 
 class Driver(CubeNode):
@@ -48,7 +48,7 @@ class Driver(CubeNode):
         super().__init__("driver", DRIVER)
         self._on_rows = on_rows
         self._node_clock = NodeClock(self)
-        self._diagnostics = Diagnostics(self, self._statuses)
+        self._diagnostics = Diagnostics(self, self._make_statuses)
 
     @property
     def failure(self) -> Exception | None:
@@ -61,22 +61,22 @@ class Driver(CubeNode):
         self._frequencies = FrequenciesPublisher(
             self,
             skin.parent_frame,
-            self.batch_profile(rate_hz, len(skin.cubes)),
+            self.make_batch_profile(rate_hz, len(skin.cubes)),
             always=self._on_rows is None,
         )
         self._info = self.own(self.create_publisher(SkinInfo, "driver/info", LATCHED))
         self._links = LiveLinks(
             make_link_configs(
                 skin,
-                self.value("port"),
-                self.value("port_directory"),
+                self.read_value("port"),
+                self.read_value("port_directory"),
             ),
             make_cube_addresses(skin),
             self._publish,
             rate=rate_hz,
             # Gathering several scans (samples of all cubes) in a message saves CPU time, but adds
             # latency, so the user decides on it by the parameter publish_period.
-            scans_per_call=scans_per_message(self.value("publish_period"), rate_hz),
+            scans_per_call=count_scans_per_message(self.read_value("publish_period"), rate_hz),
             make_rows=self._frequencies.make_rows,
             clock_ns=self._node_clock.now_ns,
             is_host_clock=lambda: not self._node_clock.is_simulated,
@@ -103,7 +103,7 @@ class Driver(CubeNode):
 
     def _rate(self) -> float | None:
         """Return the sampling rate, in Hz, that hubs are asked for; None: each hub chooses one."""
-        return float(self.value("rate")) or self._skin.rate
+        return float(self.read_value("rate")) or self._skin.rate
 
     def _publish(self, rows: FrequencyRows) -> None:
         self._frequencies.publish()
@@ -128,7 +128,7 @@ class Driver(CubeNode):
             )
         )
 
-    def _statuses(self) -> list[DiagnosticStatus]:
+    def _make_statuses(self) -> list[DiagnosticStatus]:
         """Return the diagnostics: a status about all rows (samples), and while the node is active
         one for each link (connection to a hub)."""
         if not self.is_configured:
@@ -139,7 +139,7 @@ class Driver(CubeNode):
         if self._links.cube_uids != self._published_uids:
             self._published_uids = self._links.cube_uids
             self._publish_info()
-        return self._link_diagnostics.statuses(self._links, with_links=self.is_active)
+        return self._link_diagnostics.make_statuses(self._links, with_links=self.is_active)
 
 
 class FrequenciesPublisher:

@@ -33,7 +33,7 @@ class Markers(SkinSubscriberNode):
         super().__init__("markers", MARKERS, MarkerArray, 2)
 
     def configure(self) -> None:
-        self._quantity = scene.QUANTITIES[self.value("quantity")]
+        self._quantity = scene.QUANTITIES[self.read_value("quantity")]
         self._contacts: SkinContacts | None = None
         contacts = CheckedSubscription(
             self,
@@ -50,7 +50,7 @@ class Markers(SkinSubscriberNode):
         self._canvas = Canvas(
             frame_id,
             skin.poses,
-            crosses=self.value("crosses"),
+            crosses=self.read_value("crosses"),
         )
         self._ranges = scene.Ranges()
 
@@ -58,7 +58,7 @@ class Markers(SkinSubscriberNode):
         values = skin.newest.usable_values(health)
         residual = skin.newest.residual
         shown = self._quantity.of(values, residual)
-        fixed = float(self.value("range"))
+        fixed = float(self.read_value("range"))
         last = self._ranges.colours
         top = fixed or scene.choose_automatic_top(self._quantity, shown, last)
         ranges = self._ranges = self._ranges.follow(values, residual, top)

@@ -22,7 +22,7 @@ from ...messages.compensation import encode_compensation
 from ...messages.skin_info import read_cube_poses
 from ...msg import SkinCompensation, SkinFrequencies, SkinInfo
 from ..callbacks import LOG_PERIOD_S
-from ..compat import with_number
+from ..compat import wrap_with_number
 from ..diagnostics.reconstruction import (
     LostMessages,
     ReconstructionDiagnostics,
@@ -36,7 +36,7 @@ from ..messages import (
 )
 from ..motion import MissingMotion, make_motion_source
 from ..node import CubeNode, run
-from ..qos import LATCHED, scans_per_message
+from ..qos import LATCHED, count_scans_per_message
 from .state_interfaces import make_state_interfaces
 from .stress_publisher import StressPublisher
 from .taring import Taring, tare_folder
@@ -84,28 +84,28 @@ class Reconstruction(CubeNode):
         # thread, and a driver node in this process calls `on_rows` in another thread.
         self._lock = threading.Lock()
         self._lost = LostMessages()
-        self._updater = Diagnostics(self, self._statuses)
+        self._updater = Diagnostics(self, self._make_statuses)
 
     def configure(self) -> None:
         recorded = self._recorded = self._open_recording()
         skin = self._skin = recorded.skin if recorded else self.read_skin()
         self._reconstructor = Reconstructor(skin)
-        self._reconstructor.drift_time = float(self.value("drift_time"))
+        self._reconstructor.drift_time = float(self.read_value("drift_time"))
         # A message of the driver may contain one scan more than follows from publish_period and the
         # rate. The factor 2 allows hubs to send faster than the rate in the skin file.
-        scans = scans_per_message(self.value("publish_period"), skin.rate)
+        scans = count_scans_per_message(self.read_value("publish_period"), skin.rate)
         self._max_scans = max(MAX_SCANS, 2 * (scans + 1))
 
-        profile = self.batch_profile(skin.rate, len(skin.cubes))
+        profile = self.make_batch_profile(skin.rate, len(skin.cubes))
         self._publisher = StressPublisher(
             self,
             skin,
             self._reconstructor,
             profile,
-            side=self.value("wrench_side") or None,
-            with_forces=bool(self.value("forces")),
+            side=self.read_value("wrench_side") or None,
+            with_forces=bool(self.read_value("forces")),
         )
-        false_alarms = float(self.value("touch_false_alarms"))
+        false_alarms = float(self.read_value("touch_false_alarms"))
         self._touch = None
         if false_alarms:
             self._touch = TouchPublisher(
@@ -121,7 +121,7 @@ class Reconstruction(CubeNode):
             self,
             skin,
             self._reconstructor,
-            None if recorded else tare_folder(self.value("tare_folder")),
+            None if recorded else tare_folder(self.read_value("tare_folder")),
             self._lock,
             self._publish_info,
         )
@@ -143,10 +143,10 @@ class Reconstruction(CubeNode):
             frequencies = self.create_subscription(
                 SkinFrequencies,
                 "frequencies",
-                with_number(self._on_frequencies),
+                wrap_with_number(self._on_frequencies),
                 profile,
                 raw=True,
-                event_callbacks=self._lost.new_subscription(),
+                event_callbacks=self._lost.begin_subscription(),
             )
             self.own(frequencies)
         info_now = self._publish_info()
@@ -167,7 +167,7 @@ class Reconstruction(CubeNode):
                 break
 
     def on_parameter_change(self, name: str) -> None:
-        self._reconstructor.drift_time = float(self.value("drift_time"))
+        self._reconstructor.drift_time = float(self.read_value("drift_time"))
 
     def on_rows(self, rows: FrequencyRows) -> None:
         """Compute and publish the stress for rows from a driver node in the same process.
@@ -253,7 +253,7 @@ class Reconstruction(CubeNode):
         elif self._motion:
             try:
                 last_ns = int(rows.stamp_ns.max(initial=stamp_ns))
-                motion = self._motion.motion(stamp_ns, last_ns)
+                motion = self._motion.compute_motion(stamp_ns, last_ns)
             except MissingMotion as error:
                 motion = UNKNOWN_MOTION
                 problem = f"weight is not compensated: {error}"
@@ -311,11 +311,11 @@ class Reconstruction(CubeNode):
         self._info.publish(info)
         return info
 
-    def _statuses(self) -> list[DiagnosticStatus]:
+    def _make_statuses(self) -> list[DiagnosticStatus]:
         if not self.is_configured:
             return []
         with self._lock:
-            statuses, changes = self._diagnostics.statuses(self.is_active)
+            statuses, changes = self._diagnostics.make_statuses(self.is_active)
         # Logging is slow, so it is done after the lock is released: a driver node in this process
         # may wait for the lock in another thread.
         log_changes(self.get_logger(), changes)
@@ -329,7 +329,7 @@ class Reconstruction(CubeNode):
         Raises:
             BagError: The bag cannot be read, or the library that reads bags is not installed.
         """
-        path = self.config()
+        path = self.find_config()
         if not path.is_dir() and path.suffix not in BAG_SUFFIXES:
             return None
         # The import is here and not at the top, because the library that reads bags may be missing:

@@ -28,9 +28,9 @@ class SimulatedImu(CubeNode):
         super().__init__("simulated_imu", SIMULATED_IMU)
 
     def configure(self) -> None:
-        imperfections = read_imperfections(Path(self.value("imperfections")).expanduser())
+        imperfections = read_imperfections(Path(self.read_value("imperfections")).expanduser())
         self._frame = MovingFrame(imperfections.poses)
-        self._start = Path(self.value("port_directory")) / START_FILE
+        self._start = Path(self.read_value("port_directory")) / START_FILE
         self._message = Imu()
         self._message.header.frame_id = self.read_skin().parent_frame
         # According to sensor_msgs/Imu, -1 means that the orientation is not measured.

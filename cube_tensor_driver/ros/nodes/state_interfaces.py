@@ -152,14 +152,14 @@ def make_state_interfaces(node: CubeNode, skin: Skin) -> StateInterfaces | None:
         CubeError: The skin has the same name as one of its cubes, or the package
             pal_statistics_msgs is not installed.
     """
-    component = node.value("hardware_name")
+    component = node.read_value("hardware_name")
     if not component:
         return None
     # A wrench is unknown when the link counts as silent (after three sample periods, at least
     # SILENT_S). Rows are sent only once per publish period, so this period is added.
     silent_s = max(SILENT_S, 3 / (skin.rate or DEFAULT_RATE_HZ))
-    stale_s = silent_s + node.value("publish_period")
-    wrenches = SkinWrenches(skin, node.value("wrench_side") or None, stale_s)
+    stale_s = silent_s + node.read_value("publish_period")
+    wrenches = SkinWrenches(skin, node.read_value("wrench_side") or None, stale_s)
     return StateInterfaces(node, skin, component, wrenches)
 
 

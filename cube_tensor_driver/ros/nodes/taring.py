@@ -117,7 +117,7 @@ class Taring:
             if self.uids != uids_before:
                 self._on_change()
 
-    def age(self) -> dict[str, str]:
+    def describe_age(self) -> dict[str, str]:
         """Return the number of tared cubes, and the age in seconds of the oldest tare, as texts.
 
         The keys of the dict are the keys of the diagnostic status, such as "cubes tared".
@@ -245,7 +245,7 @@ class Taring:
         """
         cubes = self._find_cubes(names)
         now_ns = self._node.get_clock().now().nanoseconds
-        duration_s = duration_s or float(self._node.value("tare_duration"))
+        duration_s = duration_s or float(self._node.read_value("tare_duration"))
         with self._lock:
             # The reconstructor keeps its newest data after the connections to the hubs were lost. A
             # tare from such old data would succeed, but with wrong values.
