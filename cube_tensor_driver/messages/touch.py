@@ -4,11 +4,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from ..touch.touch_detection import Touches
 from .point_cloud import MakeMessage, make_header
 from .types import TOUCH
+
+if TYPE_CHECKING:
+    from ..touch.touch_detection import Touches
 
 
 def make_touch_message(make: MakeMessage, frame_id: str, touches: Touches) -> object:

@@ -7,8 +7,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ..config.yaml import read_yaml
-
 Value = str | float | bool
 """Type of the value of a ROS parameter."""
 
@@ -84,7 +82,12 @@ class SimulatedHubs:
         Raises:
             ConfigError: The file of imperfections cannot be read.
         """
-        content = read_yaml(self.imperfections) if self.imperfections else None
+        if not self.imperfections:
+            return False
+        # The help of commands imports this file, and needs no YAML library.
+        from ..config.yaml import read_yaml
+
+        content = read_yaml(self.imperfections)
         return isinstance(content, dict) and bool(content.get("poses"))
 
     def process(self, config: Path) -> Process:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import struct
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
+from typing import TYPE_CHECKING
 
 from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
@@ -17,9 +18,11 @@ from ...core.rows import StressRows
 from ...messages.codec import SECOND
 from ...messages.touch import make_touch_message
 from ...msg import SkinTouch
-from ...touch.touch_detection import NO_TOUCHES, Touch
 from ..messages import make_message
 from ..node import CubeNode
+
+if TYPE_CHECKING:
+    from ...touch.touch_detection import Touch
 
 STAMP = struct.Struct("<iI")
 """Binary format of the stamp in a serialised message (CDR, little endian): seconds (int32), then
@@ -56,15 +59,24 @@ class TouchPublisher:
                 is a touch that is found although there is only noise.
             reconstructor: Computes the stress, and states its errors.
         """
-        self._set_up = partial(Touch, skin, false_alarms, reconstructor.errors)
+        self._skin = skin
+        self._false_alarms = false_alarms
+        self._reconstructor = reconstructor
         self._worker = ThreadPoolExecutor(1)
         self._future: Future[Touch] | None = None
         self._make_message = partial(make_touch_message, make_message, skin.parent_frame)
         self._publisher = node.own(node.create_lifecycle_publisher(SkinTouch, "touch", profile))
         self._rest_changes = 0
+
+    def _set_up(self) -> Touch:
+        """Set up the detection, and the message without touches."""
+        # The import takes time, which a node that nobody asks for touches does not need.
+        from ...touch.touch_detection import NO_TOUCHES, Touch
+
         # Most messages contain no touch and differ only in their stamps, so such a message is
         # serialised once, and later only its stamp is replaced.
         self._empty = bytearray(serialize_message(self._make_message(NO_TOUCHES)))
+        return Touch(self._skin, self._false_alarms, self._reconstructor.errors)
 
     def publish(self, rows: StressRows, rest_changes: int) -> None:
         """Find and publish the touches of one or several scans.
