@@ -34,10 +34,11 @@ def add_arguments(parser: Parser) -> None:
         choices=LOADS,
         default=LOADS[0],
         metavar="LOAD",
-        help=f"{', '.join(LOADS)}: compute the stress of the pads under linear stress fields, which is their response; "
-        "under forces on the upper face (influence functions); under a temperature of 1 K; or "
-        "under a specific force of 1 m/s². All but the first bond the lower face to rigid ground, "
-        "and the last two take the width as the pitch of the cubes (default: %(default)s)",
+        help=f"one of {', '.join(LOADS)}. It computes the stress of the pads under linear stress "
+        "fields, which is their response; under forces on the upper face (influence functions); "
+        "under a temperature of 1 K; or under a specific force of 1 m/s². All but the first bond "
+        "the lower face to rigid ground, and the last two take the width as the pitch of the cubes "
+        "(default: %(default)s)",
     )
     parser.add_output(
         "-o",
