@@ -33,14 +33,14 @@ class MovingSkin:
         shaken = self.amplitude * np.sin(self.rate * t) * np.array([0.6, 0.0, 0.8])
         return shaken + self.rotation(t) @ point
 
-    def specific_force(self, t: float, point, axes) -> np.ndarray:
+    def compute_specific_force(self, t: float, point, axes) -> np.ndarray:
         """(3,) at a point of the parent frame, along axes (3, 3) that are the columns."""
         before, here, after = (self.position(t + s, point) for s in (-STEP_S, 0, STEP_S))
         acceleration = (after - 2 * here + before) / STEP_S**2
         upwards = np.array([0, 0, G])
         return axes.T @ self.rotation(t).T @ (acceleration + upwards)
 
-    def angular_velocity(self, t: float, axes) -> np.ndarray:
+    def compute_angular_velocity(self, t: float, axes) -> np.ndarray:
         rate = (self.rotation(t + STEP_S) - self.rotation(t - STEP_S)) / (2 * STEP_S)
         turning = self.rotation(t).T @ rate
         return axes.T @ [turning[2, 1], turning[0, 2], turning[1, 0]]

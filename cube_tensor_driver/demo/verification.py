@@ -130,7 +130,7 @@ def compare(
     latency_ns = received_ns[first] - taken_ns
     stamp_error_ns = stamp_ns[first] - taken_ns
     return Comparison(
-        sent=taken.rows_taken(start_ns, end_ns),
+        sent=taken.count_rows_taken(start_ns, end_ns),
         received=int(represented.sum()),
         first=first,
         taken_ns=taken_ns,

@@ -89,7 +89,7 @@ class SimulatedCubes:
 
         shape = (len(calibrations), self.n_pads)
         if noise is None:
-            self._noise = np.array([frequency_noise(one) for one in calibrations])
+            self._noise = np.array([compute_frequency_noise(one) for one in calibrations])
         else:
             self._noise = np.full(shape, noise)
 
@@ -107,7 +107,7 @@ class SimulatedCubes:
 
         It is NaN if it is unknown.
         """
-        return math.nan if self._thermal is None else self._thermal.measured(seconds)
+        return math.nan if self._thermal is None else self._thermal.measure(seconds)
 
     def frequency(
         self,
@@ -139,7 +139,7 @@ class SimulatedCubes:
         if self.heavy is not None:
             pad_stress += self.heavy.stress(seconds)
         # Imperfections change the stress that determines a pad's frequency.
-        reported = self._behaviour.reported(pad_stress, seconds)
+        reported = self._behaviour.compute_reported(pad_stress, seconds)
         hertz = pad_frequency(
             reported,
             rest,
@@ -201,7 +201,7 @@ class HubCubes:
         return frequency
 
 
-def frequency_noise(calibration: Calibration) -> Array:
+def compute_frequency_noise(calibration: Calibration) -> Array:
     """Convert the noise (standard deviation) of unloaded pads from Pa to frequencies.
 
     Args:

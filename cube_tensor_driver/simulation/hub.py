@@ -117,7 +117,7 @@ class SimulatedHub:
         dropped = self.dropped & _UINT32_MASK
         return encode(Stats(uptime_ms, sequence, dropped, _SUPPLY_MV), self.version)
 
-    def device_us(self, now_us: int) -> int:
+    def read_device_us(self, now_us: int) -> int:
         """Return the value of the hub's clock in µs at simulated time `now_us`."""
         gained = round(1e-6 * self.drift_ppm * (now_us - self._drift_since_us))
         return self.boot_us + now_us + gained
@@ -128,7 +128,7 @@ class SimulatedHub:
         A clock that the fault `step` has set back can be negative, but times in frames have no
         sign.
         """
-        return max(0, self.device_us(now_us))
+        return max(0, self.read_device_us(now_us))
 
     def set_clock(
         self,
@@ -145,7 +145,7 @@ class SimulatedHub:
         """
         # The time that the clock has gained so far by its rate becomes part of its offset. So a new
         # rate does not change the clock's present value.
-        self.boot_us = self.device_us(now_us) - now_us + step_us
+        self.boot_us = self.read_device_us(now_us) - now_us + step_us
         self.drift_ppm = self.drift_ppm if drift_ppm is None else drift_ppm
         self._drift_since_us = now_us
 

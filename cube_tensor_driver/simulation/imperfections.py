@@ -277,7 +277,7 @@ class PadBehaviour:
         sizes = factor * (weight * step)[:, None, None]
         self._creep_size = np.concatenate([self._creep_size, sizes])
 
-    def reported(self, stress: Array, seconds: float) -> Array:
+    def compute_reported(self, stress: Array, seconds: float) -> Array:
         """Compute the stress that the pads report, and advance their creep.
 
         Args:

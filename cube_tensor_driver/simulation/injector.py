@@ -183,7 +183,7 @@ class Injector:
         entry = (at_us, begins, number, act)
         heapq.heappush(self._schedule, entry)
 
-    def due_us(self) -> int | None:
+    def find_due_us(self) -> int | None:
         """Return the simulated time in µs at which the next fault begins or ends.
 
         The result is None if no fault is scheduled.
@@ -196,7 +196,7 @@ class Injector:
             *_, act = heapq.heappop(self._schedule)
             act(now_us)
 
-    def measured(
+    def measure(
         self,
         link: SimulatedLink,
         frequency: Millihertz,
@@ -239,7 +239,7 @@ class Injector:
         no_cubes, pads_behind = (0, 0), (0, link.hub.extra_pads)
         return np.pad(frequency, (no_cubes, pads_behind))
 
-    def transmitted(self, link: SimulatedLink, data: bytes) -> bytes:
+    def transmit(self, link: SimulatedLink, data: bytes) -> bytes:
         """Return the bytes that are sent on a link in place of one frame (message) with a sample.
 
         Args:

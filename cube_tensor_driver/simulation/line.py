@@ -118,10 +118,10 @@ class SimulatedLine:
 
     def is_waiting(self, now_us: int) -> bool:
         """Return whether bytes wait to be sent although no fault (stall or burst) delays them."""
-        is_delayed = self.due_us(now_us) is not None
+        is_delayed = self.find_due_us(now_us) is not None
         return self.plugged and bool(self._queue) and not is_delayed
 
-    def due_us(self, now_us: int) -> int | None:
+    def find_due_us(self, now_us: int) -> int | None:
         """Return the simulated time in µs at which a stall or burst lets waiting bytes be sent.
 
         Args:

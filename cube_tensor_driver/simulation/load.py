@@ -202,7 +202,7 @@ class Load:
         gradient = np.zeros((n, 6, 3))
         below = np.array([[0.0, 0.0, -self.depth]])
         outward = rotation[:, :, 2]
-        for load in self.contact_loads(seconds):
+        for load in self.find_contact_loads(seconds):
             # Position of the contact and force, in the frame of each cube.
             offset = load.position - position
             local = np.einsum("nij,ni->nj", rotation, offset)
@@ -235,7 +235,7 @@ class Load:
                 gradient[rows] += slope[:, 0]
         return stress, gradient
 
-    def contact_loads(self, seconds: float) -> list[ContactLoad]:
+    def find_contact_loads(self, seconds: float) -> list[ContactLoad]:
         """Return the contacts of all indenters that touch the skin at a time in s."""
         if self.script.period is not None:
             seconds %= self.script.period
@@ -251,7 +251,7 @@ class Load:
 
     def total(self, seconds: float) -> Resultant:
         """Return total force, centre of pressure and mean normal of all contacts at a time in s."""
-        return total(self.contact_loads(seconds))
+        return total(self.find_contact_loads(seconds))
 
     def _check(self, indenter: Indenter) -> None:
         """Raise ConfigError if an indenter's contact under its largest force is too wide.
@@ -293,7 +293,7 @@ class Load:
         position, velocity = self._to_metres(action.path[0]), np.zeros(3)
         if path:
             position, velocity = path.at(progress)
-        normal = surface_normal(self.poses, self._pitch, position)
+        normal = compute_surface_normal(self.poses, self._pitch, position)
         size = float(interpolate_knots(action.force, progress))
         if path and action.kind == "slide":
             # Friction acts along the part of the velocity that is tangential to the skin.
@@ -358,7 +358,7 @@ class Load:
         return CubicSpline(self._to_metres(action.path), closed=closed)
 
 
-def surface_normal(
+def compute_surface_normal(
     poses: CubePoses,
     pitch: float,
     position: Array,

@@ -83,7 +83,7 @@ class MovingFrame:
         values = [np.interp(eased, self._numbers, column) for column in self._columns]
         return np.array(values[:3]), rotation_from_rpy(*values[3:])
 
-    def angular_velocity(self, seconds: float) -> Array:
+    def compute_angular_velocity(self, seconds: float) -> Array:
         """Return the angular velocity (3,) in rad/s, in the parent frame, at a time in s."""
         times = seconds - STEP_S, seconds, seconds + STEP_S
         (_, before), (_, now), (_, after) = map(self._compute_pose, times)
@@ -96,7 +96,7 @@ class MovingFrame:
             ]
         )
 
-    def specific_force(
+    def compute_specific_force(
         self,
         seconds: float,
         points: Array,
@@ -142,11 +142,13 @@ class HeavyPads:
         self._cubes = poses
         self._frame = MovingFrame(knots)
 
-    def specific_force(self, seconds: float) -> Array:
+    def compute_specific_force(self, seconds: float) -> Array:
         """Return the specific force (cubes, 3) in m/s² at each cube, in the frame of the cube."""
-        return self._frame.specific_force(seconds, self._cubes.position, self._cubes.rotation)
+        return self._frame.compute_specific_force(
+            seconds, self._cubes.position, self._cubes.rotation
+        )
 
     def stress(self, seconds: float) -> Array:
         """Return the stress of the pads by weight and inertia (cubes, P), in Pa."""
-        force = self.specific_force(seconds)
+        force = self.compute_specific_force(seconds)
         return np.asarray(force @ self._response.T)

@@ -240,7 +240,7 @@ class SampleTable:
         # A row without a match has the index `NO_MATCH`, which is -1 and selects the last element.
         return np.append(among, NO_MATCH)[found]
 
-    def rows_taken(self, start_ns: int, end_ns: int) -> int:
+    def count_rows_taken(self, start_ns: int, end_ns: int) -> int:
         """Count the rows (samples of one cube) that the hubs took in an interval of time.
 
         Args:

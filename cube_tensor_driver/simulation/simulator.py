@@ -259,10 +259,10 @@ class Simulator:
             report_us: Simulated time in µs of the next HELLO and STATS.
         """
         now = self.now_us()
-        times: list[int | None] = [report_us, self._injector.due_us()]
+        times: list[int | None] = [report_us, self._injector.find_due_us()]
         for link in self._links:
             sample_us = link.hub.next_us if link.hub.started else None
-            times += [sample_us, link.line.due_us(now)]
+            times += [sample_us, link.line.find_due_us(now)]
         return min(time for time in times if time is not None)
 
     def _take_samples(self, now_us: int, stop: StopRequest) -> None:
@@ -304,9 +304,9 @@ class Simulator:
         celsius = link.carried.cubes.temperature(time_us * 1e-6)
         if not math.isnan(celsius):
             link.hub.celsius = round(100 * celsius)
-        measured = self._injector.measured(link, frequency, time_us)
+        measured = self._injector.measure(link, frequency, time_us)
         frame = link.hub.sample(measured)
-        sent = self._injector.transmitted(link, frame)
+        sent = self._injector.transmit(link, frame)
         # If the line has no room for the frame, the hub drops the sample and counts it.
         if not link.line.send(sent, now_us):
             link.hub.dropped += 1

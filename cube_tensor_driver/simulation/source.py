@@ -210,7 +210,7 @@ class SkinPads:
             frequency[rows, : pads.n_pads] = to_hertz(millihertz)
             temperature[rows] = pads.temperature(seconds)
             if pads.heavy is not None:
-                forces.append(pads.heavy.specific_force(seconds))
+                forces.append(pads.heavy.compute_specific_force(seconds))
             start = rows.stop
         return FrequencyRows.of(
             self._cube,

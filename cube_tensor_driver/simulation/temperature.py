@@ -221,7 +221,7 @@ class ThermalPads:
         # The two rows of each array are times in s and temperatures in °C.
         self._knots = [ground, air]
         self._seconds = 0.0
-        outside = self._outside(0.0)
+        outside = self._find_outside_temperatures(0.0)
         self._layer = WarmLayer(height, imperfections.heat_exchange, *outside)
 
         # Centres of the finite volumes, from -1 at the ground to 1 at the surface.
@@ -237,14 +237,14 @@ class ThermalPads:
         to_centre = height_above_ground - centre
         self._in_cube = np.abs(to_centre) < layer.side / 2
 
-    def _outside(self, seconds: float) -> tuple[float, float]:
+    def _find_outside_temperatures(self, seconds: float) -> tuple[float, float]:
         """Return the temperatures of ground and air at a time in s, in °C."""
         ground, air = (float(np.interp(seconds, *knots)) for knots in self._knots)
         return ground, air
 
-    def measured(self, seconds: float) -> float:
+    def measure(self, seconds: float) -> float:
         """Return what the hub's thermometer measures, the temperature of the ground, in °C."""
-        return round(self._outside(seconds)[0], 2)
+        return round(self._find_outside_temperatures(seconds)[0], 2)
 
     def at(self, seconds: float) -> tuple[Array, Array]:
         """Return the effect of temperature on the pads.
@@ -259,7 +259,7 @@ class ThermalPads:
         knots = np.concatenate([times for times, _ in self._knots])
         passed = knots[(knots > self._seconds) & (knots < seconds)]
         for time in [*sorted(passed.tolist()), seconds]:
-            outside = self._outside(time)
+            outside = self._find_outside_temperatures(time)
             self._layer.advance(time - self._seconds, *outside)
             self._seconds = time
 

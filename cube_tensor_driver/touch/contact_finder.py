@@ -167,7 +167,7 @@ class ContactFinder(Protocol):
             Whether a contact has begun to slip.
         """
 
-    def cloud(self, values: Array) -> Array | None:
+    def make_cloud(self, values: Array) -> Array | None:
         """Return the traction on the surface as a point cloud; call `update` with `values` before.
 
         Args:
@@ -180,7 +180,7 @@ class ContactFinder(Protocol):
         """
 
 
-def contact_finder(
+def make_contact_finder(
     settings: ContactSettings,
     poses: CubePoses,
     calibrations: Sequence[Calibration],
@@ -229,7 +229,7 @@ class _InterpolationFinder:
     def follow(self, time_s: float, values: Array) -> bool:
         return False
 
-    def cloud(self, values: Array) -> None:
+    def make_cloud(self, values: Array) -> None:
         return None
 
 
@@ -305,7 +305,7 @@ class _InverseFinder:
     def follow(self, time_s: float, values: Array) -> bool:
         return self._slip.update(time_s, values)
 
-    def cloud(self, values: Array) -> Array:
+    def make_cloud(self, values: Array) -> Array:
         field = self._tracker.field
         along_x, along_y, _ = field.traction.T
         shear = np.hypot(along_x, along_y)

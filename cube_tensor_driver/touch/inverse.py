@@ -26,10 +26,10 @@ from ..mechanics.layer import Layer
 from ..mechanics.measurement_model import CubeMeasurement, MeasurementModel
 from ..mechanics.traction_prior import TractionPrior
 from .pad_measurement import model_pads
-from .pad_noise import GAIN_ERROR, compute_noise_of_all_pads, stress_matrices
+from .pad_noise import GAIN_ERROR, compute_noise_of_all_pads, make_stress_matrices
 from .posterior import ObservationModel, WindowPosteriors
 from .prediction import MissingValuePrediction
-from .surface import patches
+from .surface import place_patches
 from .unrolled_skin import unroll
 
 MAX_PITCH_OF_FOUR_POINTS = 3.25
@@ -227,7 +227,7 @@ class SurfaceInverse:
         self.spacing = self.pitch / side
         self.area = self.spacing**2
         above = depth * poses.rotation[:, None, :, 2]
-        points = patches(poses, self.spacing, side) + above
+        points = place_patches(poses, self.spacing, side) + above
         self.points = points.reshape(-1, 3)
         self.cube = np.repeat(np.arange(n), side**2)
 
@@ -269,7 +269,7 @@ class SurfaceInverse:
         self.errors = np.zeros((n, len(self.columns), 0))
         self._error_variance = np.zeros((len(self.points), 2))
 
-    def scaled(self, values: Array) -> Array:
+    def scale_values(self, values: Array) -> Array:
         """Select the components that some cube of the skin observes, and convert them to Pa.
 
         Args:
@@ -353,7 +353,7 @@ class SurfaceInverse:
         # all these changes at once. The causes are independent, so their variances add up.
         self._error_variance = np.zeros((len(self.points), 2))
         for column in np.moveaxis(scaled, 2, 0):
-            field = self.field_of_scaled(np.where(self._known, column, np.nan))
+            field = self.compute_field_of_scaled(np.where(self._known, column, np.nan))
             self._error_variance += np.stack([field.pressure, field.depth_pressure], axis=1) ** 2
 
     @property
@@ -372,26 +372,27 @@ class SurfaceInverse:
             Traction at all points; 0 at points for which none of the `WINDOW_CUBES` nearest cubes
             has a value.
         """
-        return self.field_of_scaled(self.scaled(values))
+        return self.compute_field_of_scaled(self.scale_values(values))
 
-    def field_of_scaled(self, scaled: Array) -> TractionField:
+    def compute_field_of_scaled(self, scaled: Array) -> TractionField:
         """Compute the traction that explains values in Pa.
 
         Args:
-            scaled: Values (cubes, C) in Pa as from `scaled`, NaN where unknown.
+            scaled: Values (cubes, C) in Pa as from `scale_values`, NaN where unknown.
 
         Returns:
             Traction at all points, as from `field`.
         """
         # The results are sorted by cube and then by point of its patch, as `points` are.
         y = self._fill(scaled)
-        result = self._windows.product(y).astype(np.float64)
+        result = self._windows.compute_product(y).astype(np.float64)
         rows = result.reshape(len(self.points), -1)
         return TractionField(rows[:, :3], rows[:, 3])
 
-    def depth_pressure_of_scaled(self, scaled: Array) -> Array:
-        """Return only `TractionField.depth_pressure` (M,) of `field_of_scaled`, which is faster."""
-        return self._windows.product(self._fill(scaled), only_pressure=True).ravel().astype(float)
+    def compute_depth_pressure_of_scaled(self, scaled: Array) -> Array:
+        """Return only `depth_pressure` (M,) of `compute_field_of_scaled`, which is faster."""
+        pressure = self._windows.compute_product(self._fill(scaled), only_pressure=True)
+        return pressure.ravel().astype(float)
 
     def deviation(self, values: Array) -> FieldDeviation:
         """Compute the standard deviations of the traction field that `field` returns.
@@ -401,16 +402,16 @@ class SurfaceInverse:
         Args:
             values: Components (cubes, 15) in Pa and Pa/m, NaN where unknown, as for `field`.
         """
-        scaled = self.scaled(values)
-        return self.residual_deviation(scaled, scaled)
+        scaled = self.scale_values(values)
+        return self.compute_residual_deviation(scaled, scaled)
 
-    def residual_deviation(self, residual: Array, scaled: Array) -> FieldDeviation:
+    def compute_residual_deviation(self, residual: Array, scaled: Array) -> FieldDeviation:
         """Compute the standard deviations of the field that is computed from a residual.
 
         Args:
             residual: Values (cubes, C) in Pa minus the response of the cubes to the contacts that
                 the contact tracker has fitted.
-            scaled: Values (cubes, C) in Pa as from `scaled`. Errors of the pads' gains are
+            scaled: Values (cubes, C) in Pa as from `scale_values`. Errors of the pads' gains are
                 proportional to them.
         """
         y = self._fill(residual)
@@ -418,7 +419,7 @@ class SurfaceInverse:
         # noise: 1 for the noise itself, plus the variance that the error of the pad's gain causes.
         known = self._known
         known_values = np.where(known, scaled, 0.0)
-        to_pads = stress_matrices(self.by_pad, known)
+        to_pads = make_stress_matrices(self.by_pad, known)
         stresses = to_pads @ known_values[:, :, None]
         gain_deviation = GAIN_ERROR * stresses[:, :, 0]
         variance_with_values = gain_deviation**2 + 1
@@ -431,8 +432,8 @@ class SurfaceInverse:
         scale = windows.scale(y, pad_variance, known)
         prior = windows.prior[windows.kind] + self._prediction.variance
         variance = scale[:, None] * prior
-        variance += windows.noise(pad_variance)
-        variance += self._prediction.noise(pad_variance)
+        variance += windows.compute_noise(pad_variance)
+        variance += self._prediction.compute_noise(pad_variance)
         variance += self._error_variance.reshape(variance.shape)
         deviation = np.sqrt(variance)
         on_surface, at_depth = deviation.reshape(-1, 2).T

@@ -70,7 +70,7 @@ def compute_noise_of_all_pads(calibrations: Sequence[Calibration]) -> Array:
     return compute_noise_by_pad(Pipeline(calibrations), np.arange(n), no_pads)
 
 
-def stress_matrices(by_pad: Array, known: Mask) -> Array:
+def make_stress_matrices(by_pad: Array, known: Mask) -> Array:
     """Return the matrices (n, P, C) with which C components of n cubes give the stresses of P pads.
 
     The stresses are the smallest ones that explain the components, each divided by the standard

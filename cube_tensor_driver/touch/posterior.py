@@ -188,8 +188,8 @@ class WindowPosteriors:
         self.by_pad = solved["by_pad"]
         self.trace = solved["trace"]
 
-        # In `product`, all windows that are the only ones of their kind are multiplied in one
-        # batch, the others one kind at a time.
+        # In `compute_product`, all windows that are the only ones of their kind are multiplied in
+        # one batch, the others one kind at a time.
         self._rows = []
         for kind in kinds:
             rows = np.flatnonzero(self.kind == kind)
@@ -242,7 +242,7 @@ class WindowPosteriors:
         ]
         return _number_distinct(np.concatenate(features, axis=1))
 
-    def product(self, y: Single, only_pressure: bool = False) -> Single:
+    def compute_product(self, y: Single, only_pressure: bool = False) -> Single:
         """Compute the posterior mean G y (head of this file) of the traction around all cubes.
 
         Args:
@@ -305,7 +305,7 @@ class WindowPosteriors:
         mean_excess = excess / np.maximum(count, 1)
         return np.where(count > 0, mean_excess, 1.0)
 
-    def noise(self, pad_variance: Single) -> Array:
+    def compute_noise(self, pad_variance: Single) -> Array:
         """Compute the variances of the pressures that the errors of the pads cause.
 
         Args:

@@ -159,7 +159,7 @@ class MissingValuePrediction:
             filled[one.cube, one.columns] = one.weights @ neighbours
         return filled
 
-    def noise(self, pad_variance: Single) -> Array:
+    def compute_noise(self, pad_variance: Single) -> Array:
         """Compute the variances that pad noise adds to the pressures through the predicted values.
 
         Missing values are predicted from other values, which contain the noise of the pads.

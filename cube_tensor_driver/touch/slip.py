@@ -281,7 +281,7 @@ class SlipEstimator:
             found: The contacts.
             values: Components (cubes, 15) in Pa and Pa/m in which they were found.
         """
-        scaled = self._inverse.scaled(values)
+        scaled = self._inverse.scale_values(values)
         ids = self._contacts["id"].tolist()
         contacts = np.zeros(len(found), self._contacts.dtype)
         contacts["past"] = np.nan
@@ -348,7 +348,7 @@ class SlipEstimator:
         contacts = self._contacts
         if not len(contacts):
             return False
-        scaled = self._inverse.scaled(values)
+        scaled = self._inverse.scale_values(values)
         loads = self._follow(scaled)
         self._linearise_changed(loads, scaled)
         self._observe_shear(scaled)
@@ -523,7 +523,7 @@ class SlipEstimator:
         They follow from the changes of the cubes' values, with the stored derivatives.
 
         Args:
-            scaled: Components (cubes, C) in Pa of the scan, as from `SurfaceInverse.scaled`.
+            scaled: Components (cubes, C) in Pa of the scan, as from `SurfaceInverse.scale_values`.
         """
         contacts = self._contacts
         # A value that is missing counts as unchanged.

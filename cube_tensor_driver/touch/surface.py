@@ -148,7 +148,7 @@ class Surface:
         self.pitch = poses.pitch
         self.spacing = self.pitch / side
         self.area = self.spacing**2
-        self._patches = patches(poses, self.spacing, side)
+        self._patches = place_patches(poses, self.spacing, side)
         self.points = self._patches.reshape(-1, 3)
         self.cube = np.repeat(np.arange(n), side**2)
         first_point = np.arange(n) * side**2
@@ -388,7 +388,7 @@ def make_square_points(spacing: float, side: int) -> Array:
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
-def patches(
+def place_patches(
     poses: CubePoses,
     spacing: float,
     side: int,

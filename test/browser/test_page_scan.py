@@ -27,7 +27,7 @@ from cube_tensor_driver.messages.contacts import decode_traction, make_traction_
 from cube_tensor_driver.ros.messages import make_message
 from cube_tensor_driver.simulation.load import Load, default_script
 from cube_tensor_driver.touch.inverse import SurfaceInverse
-from cube_tensor_driver.touch.surface import Surface, patches
+from cube_tensor_driver.touch.surface import Surface, place_patches
 
 DEPTH = 0.004
 """Depth of the cubes' centres below the surface, in m."""
@@ -45,7 +45,7 @@ def poses() -> CubePoses:
 
 def cloud_of(poses: CubePoses) -> np.ndarray:
     """Return a point cloud of traction as the node publishes it, with 2 x 2 points per cube."""
-    points = patches(poses, PITCH / 2, 2).reshape(-1, 3) + np.array([0, 0, DEPTH])
+    points = place_patches(poses, PITCH / 2, 2).reshape(-1, 3) + np.array([0, 0, DEPTH])
     pressure = 1e3 + 1e5 * points[:, 0] - 2e5 * points[:, 1]
     return np.column_stack([points, pressure, 0.3 * pressure, 70.0 + 0.01 * pressure])
 

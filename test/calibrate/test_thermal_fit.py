@@ -31,7 +31,7 @@ from cube_tensor_driver.core.status import COMPENSATION, THERMAL
 from cube_tensor_driver.messages.types import FREQUENCIES, INFO
 from cube_tensor_driver.simulation.cubes import PadErrors, SimulatedCubes
 from cube_tensor_driver.simulation.imperfections import Imperfections
-from cube_tensor_driver.touch.contact_finder import ContactSettings, contact_finder
+from cube_tensor_driver.touch.contact_finder import ContactSettings, make_contact_finder
 
 CUBE = find_shipped_calibration(LAYOUTS["cube"])
 LOAD = np.array([-2e3, -1500.0, -5000.0, 0.0, 300.0, 0.0])  # Pa
@@ -154,7 +154,7 @@ def test_a_fast_ramp_is_no_contact_and_hides_none(fitted, tared):
     x, y = 0.024 * (np.indices((3, 3)).reshape(2, 9) - 1)
     poses = CubePoses(np.stack([x, y, 0 * x], 1), np.tile(np.eye(3), (9, 1, 1)), np.full(9, 2e-3))
     nine, elastomer = [calibrations[k] for k in which], Elastomer(depth=5.5e-3, thickness=11e-3)
-    finders = (contact_finder(ContactSettings(), poses, nine, elastomer) for _ in range(3))
+    finders = (make_contact_finder(ContactSettings(), poses, nine, elastomer) for _ in range(3))
     finder, blind, informed = finders
     centre, flat = np.array([4e-3, 2e-3]), np.zeros(9, np.intp)
     offset = poses.position[:, :2] - centre

@@ -168,8 +168,8 @@ def imu_message(moving: MovingSkin, t: float) -> Imu:
     message = Imu()
     message.header.stamp = to_time(START_NS + round(1e9 * t))
     message.header.frame_id = "imu"
-    force = moving.specific_force(t, IMU_POINT, IMU_AXES)
-    velocity = moving.angular_velocity(t, IMU_AXES)
+    force = moving.compute_specific_force(t, IMU_POINT, IMU_AXES)
+    velocity = moving.compute_angular_velocity(t, IMU_AXES)
     a, w = message.linear_acceleration, message.angular_velocity
     (a.x, a.y, a.z), (w.x, w.y, w.z) = force.tolist(), velocity.tolist()
     return message
@@ -191,7 +191,7 @@ def scan_at(t: float, moving: MovingSkin | None = None) -> FrequencyRows:
 
 def true_force(moving: MovingSkin, t: float, cube: int) -> np.ndarray:
     point, angles = CUBES[cube]
-    return moving.specific_force(t, point, rotation_from_rpy(*angles))
+    return moving.compute_specific_force(t, point, rotation_from_rpy(*angles))
 
 
 def fake_tf(monkeypatch, **frames) -> None:

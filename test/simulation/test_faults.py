@@ -63,8 +63,8 @@ class FaultyLink(SimulatedLink):
         for _ in range(samples):
             self.injector.step(self.hub.next_us)
             if self.hub.started:
-                measured = self.injector.measured(self, VALUES, self.hub.next_us)
-                data = self.injector.transmitted(self, self.hub.sample(measured))
+                measured = self.injector.measure(self, VALUES, self.hub.next_us)
+                data = self.injector.transmit(self, self.hub.sample(measured))
                 self.line.send(data, self.hub.next_us)
             else:
                 self.hub.next_us += PERIOD_US

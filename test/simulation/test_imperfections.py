@@ -26,10 +26,10 @@ CREEP = ((0.1, 0.5), (0.05, 20.0))
 def test_foam_creeps_under_a_step_and_recovers():
     """v (1 + sum c (1 - exp(-t/tau))) while it is pressed for 3 s, and what is left of it after."""
     pads = PadBehaviour(Imperfections(creep=CREEP), (1, 1), 0)
-    pads.reported(np.zeros((1, 1)), 0.0)
+    pads.compute_reported(np.zeros((1, 1)), 0.0)
     pressed, held = 1e4, 3.0
     for time in np.arange(0.01, 6.0, 0.01):
-        found = pads.reported(np.full((1, 1), pressed * (time < held + 5e-3)), time)[0, 0]
+        found = pads.compute_reported(np.full((1, 1), pressed * (time < held + 5e-3)), time)[0, 0]
         loaded, after = min(time, held), max(time - held, 0.0)
         crept = sum(c * -np.expm1(-loaded / tau) * np.exp(-after / tau) for c, tau in CREEP)
         assert found == pytest.approx(pressed * (crept + (after < 5e-3)), rel=1e-9)
@@ -45,8 +45,11 @@ def test_a_power_law_of_creep_follows_its_closed_form(exponent):
     wanted = Imperfections(creep_growth=0.1, creep_exponent=exponent, creep_spread=spread, seed=1)
     pads = PadBehaviour(wanted, (50, 24), 0)
     held = 7200.0
-    pads.reported(np.zeros((50, 24)), 1.0)
-    crept = {t: pads.reported(np.ones((50, 24)), 1.0 + t) for t in (0.01, 1.0, 600.0, 3600.0, held)}
+    pads.compute_reported(np.zeros((50, 24)), 1.0)
+    crept = {
+        t: pads.compute_reported(np.ones((50, 24)), 1.0 + t)
+        for t in (0.01, 1.0, 600.0, 3600.0, held)
+    }
     growth = crept[600.0] - 1
     # Of 1200 pads; four standard deviations of the estimates.
     assert growth.mean() == pytest.approx(0.1, abs=4 * 0.1 * spread / np.sqrt(1200))
@@ -54,20 +57,22 @@ def test_a_power_law_of_creep_follows_its_closed_form(exponent):
     factor = growth / (600**exponent - 1)
     for time, found in crept.items():
         np.testing.assert_allclose(found, 1 + factor * (time**exponent - 1), atol=5e-5)
-    after = pads.reported(np.zeros((50, 24)), 1.0 + held + 10.0)
+    after = pads.compute_reported(np.zeros((50, 24)), 1.0 + held + 10.0)
     left = factor * ((held + 10.0) ** exponent - 10.0**exponent)
     np.testing.assert_allclose(after, left, atol=5e-5)
 
 
 def test_gains_spread_and_pads_fail_as_often_as_asked_for_and_always_alike():
     stress, wanted = np.full((500, 24), -1e4), Imperfections(gain_spread=0.05, dead=0.1, seed=3)
-    found = PadBehaviour(wanted, stress.shape, 0).reported(stress, 1.0)
+    found = PadBehaviour(wanted, stress.shape, 0).compute_reported(stress, 1.0)
     # Of 12,000 pads; four standard deviations of the estimates.
     assert np.isnan(found).mean() == pytest.approx(0.1, abs=4 * np.sqrt(0.09 / 12e3))
     assert np.nanstd(found / stress) == pytest.approx(0.05, rel=4 / np.sqrt(2 * 10.8e3))
-    again = PadBehaviour(wanted, stress.shape, 0).reported(stress, 1.0)
+    again = PadBehaviour(wanted, stress.shape, 0).compute_reported(stress, 1.0)
     np.testing.assert_array_equal(again, found)
-    assert not np.array_equal(PadBehaviour(wanted, stress.shape, 1).reported(stress, 1.0), found)
+    assert not np.array_equal(
+        PadBehaviour(wanted, stress.shape, 1).compute_reported(stress, 1.0), found
+    )
 
 
 def test_a_simulated_skin_has_them():

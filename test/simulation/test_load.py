@@ -113,7 +113,7 @@ def test_few_points_from_afar_are_as_good(tmp_path):
             skin_of(places), script_of(tmp_path, PRESS, shape=shape, radius=radius, poisson=0.5)
         )
         found = load.at(1.5)
-        press = load.contact_loads(1.5)[0]
+        press = load.find_contact_loads(1.5)[0]
         sources, forces = getattr(contact, "hertz" if shape == "sphere" else shape)(
             press.radius, press.force, order=24
         )
@@ -154,7 +154,7 @@ def test_a_slide_is_a_press_moved(tmp_path):
     np.testing.assert_allclose(roll.total(1.0)[0], [0, 0, -3], atol=1e-12)
     np.testing.assert_allclose(roll.total(1.0)[1], [0.005, 0.02, 0])
     # at rest at both ends
-    np.testing.assert_allclose(slide.contact_loads(1e-6)[0].position, [-0.01, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(slide.find_contact_loads(1e-6)[0].position, [-0.01, 0, 0], atol=1e-9)
 
 
 @pytest.mark.parametrize("closed", [False, True])

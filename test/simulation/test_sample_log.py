@@ -93,9 +93,9 @@ def test_when_a_sample_was_taken_and_how_many_in_a_span():
     assert ((time_ns[:5] - START_NS) // 1000).tolist() == expected_us
     assert sample[5] == NO_MATCH
     # Two cubes on each hub; the hub of 10 samples and the wrapped one in the first 20 ms.
-    assert LOG.table.rows_taken(START_NS, START_NS + 20_000_000) == 2 * 10 + 2 * 10
-    assert LOG.table.rows_taken(START_NS, START_NS + 10_000_001) == 2 * 6 + 2 * 6
-    assert LOG.table.rows_taken(START_NS, END_NS) == 2 * 30 + 2 * 10
+    assert LOG.table.count_rows_taken(START_NS, START_NS + 20_000_000) == 2 * 10 + 2 * 10
+    assert LOG.table.count_rows_taken(START_NS, START_NS + 10_000_001) == 2 * 6 + 2 * 6
+    assert LOG.table.count_rows_taken(START_NS, END_NS) == 2 * 30 + 2 * 10
 
 
 @pytest.mark.parametrize("kind", [Arrivals, HubArrivals])

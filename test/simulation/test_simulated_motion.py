@@ -54,7 +54,7 @@ def test_a_gyroscope_measures_along_the_axes_of_the_skin():
     frame = MovingFrame([(0.0, 0, 0, 0, 0.3, 0.5, 0.0), (1.0, 0, 0, 0, 0.3, 0.5, 1.0)])
     rate = 0.5 * np.pi * np.sin(np.pi * 0.25)
     in_skin = rotation_from_rpy(0.3, 0.5, 0.0).T @ [0, 0, rate]
-    np.testing.assert_allclose(frame.angular_velocity(0.25), in_skin, atol=1e-5)
+    np.testing.assert_allclose(frame.compute_angular_velocity(0.25), in_skin, atol=1e-5)
 
 
 def test_a_file_without_weight_or_for_other_pads_is_refused():

@@ -140,7 +140,7 @@ def test_the_noise_of_a_cube_is_how_its_values_scatter_with_the_gains_and_the_co
     )
     count = len(bench.poses.position)
     pads = bench.compute_pads_in(np.repeat(field, count, axis=0))
-    drawn = [bench.inverse.scaled(bench.measure(pads, random)) for _ in range(12)]
+    drawn = [bench.inverse.scale_values(bench.measure(pads, random)) for _ in range(12)]
     noise = CubeNoise(bench.inverse)
     noise.update(drawn[0], np.arange(count))
     local = LocalValues(bench.inverse, noise, 0, np.arange(1))
@@ -160,11 +160,13 @@ def test_where_nothing_is_left_the_field_is_as_unsure_as_noise_and_gains_make_it
     inverse, force = bench.inverse, np.array([0.6, 0.3, -3.0])
     field = bench.compute_truth(bench.poses.position[:, :2], 8e-3, force, np.array([1e-3, 2e-3]))
     pads = bench.compute_pads_in(field)
-    drawn = np.stack([inverse.scaled(bench.measure(pads, random)) for _ in range(100)])
+    drawn = np.stack([inverse.scale_values(bench.measure(pads, random)) for _ in range(100)])
     drawn[:, lost] = np.nan
     middle = drawn.mean(axis=0)
-    below = np.array([inverse.field_of_scaled(values - middle).depth_pressure for values in drawn])
-    stated = inverse.residual_deviation(0 * middle, middle).depth_pressure
+    below = np.array(
+        [inverse.compute_field_of_scaled(values - middle).depth_pressure for values in drawn]
+    )
+    stated = inverse.compute_residual_deviation(0 * middle, middle).depth_pressure
     # 100 draws of pads leave 2 % open, summed over the points.
     near = inverse.cube == 40
     for points in (near, ~near):

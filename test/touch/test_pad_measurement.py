@@ -25,7 +25,7 @@ from cube_tensor_driver.mechanics.contact_response import ContactResponse
 from cube_tensor_driver.mechanics.influence import read_influence, write_influence
 from cube_tensor_driver.mechanics.measurement_model import CubeMeasurement
 from cube_tensor_driver.mechanics.traction_prior import PRIOR_LENGTHS, SHEAR_RATIO, TractionPrior
-from cube_tensor_driver.touch.contact_finder import ContactSettings, contact_finder
+from cube_tensor_driver.touch.contact_finder import ContactSettings, make_contact_finder
 from cube_tensor_driver.touch.pad_measurement import model_pads
 from cube_tensor_driver.touch.pad_noise import compute_noise_by_pad
 from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
@@ -139,7 +139,7 @@ def test_pads_that_are_left_out_change_what_a_cube_says_and_the_contact_stays(
     bench, random = LayerBench(setting, influence, side=1), np.random.default_rng(4)
     settings = ContactSettings(method="inverse", influence="cube_11mm")
     n = len(bench.poses.position)
-    finder = contact_finder(settings, bench.poses, [calibration] * n)
+    finder = make_contact_finder(settings, bench.poses, [calibration] * n)
     pads, left_out = bench.compute_pads_under(5e-3, load, centre), np.zeros(n, np.uint32)
     near = np.argsort(np.linalg.norm(bench.poses.position[:, :2] - centre, axis=1))[:4]
     for bits in (0, [1, 2, 4, 8], [3, 0, 8, 0], 0):

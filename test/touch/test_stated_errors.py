@@ -17,7 +17,7 @@ from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.simulation.motion import read_weight
-from cube_tensor_driver.touch.contact_finder import ContactSettings, contact_finder
+from cube_tensor_driver.touch.contact_finder import ContactSettings, make_contact_finder
 from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
 
 SIDE, PITCH, G = 5, 12e-3, 9.81
@@ -34,7 +34,9 @@ def test_turning_over_is_no_contact_and_hides_none_that_is_stronger():
     response = read_weight("cube_11mm", 24)
     cube = replace(illustrative("cube"), weight=WeightModel(response))
     reconstruct = Reconstructor([cube] * n)
-    finders = (contact_finder(ContactSettings(), poses, [cube] * n, ELASTOMER) for _ in range(3))
+    finders = (
+        make_contact_finder(ContactSettings(), poses, [cube] * n, ELASTOMER) for _ in range(3)
+    )
     finder, blind, without_errors = finders
     touch = below_ball(poses, ELASTOMER.depth, 5e-3, (1e-3, 2e-3), (0, 0, -0.09))
     n_false = n_found = n_coarse = 0

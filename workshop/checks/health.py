@@ -15,7 +15,7 @@ from cube_tensor_driver.core.arrays import Array, Index, Mask
 from cube_tensor_driver.core.health.statistics import WINDOW_S
 from cube_tensor_driver.core.rows import StressRows
 from cube_tensor_driver.core.status import DRIFT, NOISY, OPEN, RANGE, REPORTED, SHORT, STUCK
-from cube_tensor_driver.simulation.cubes import frequency_noise
+from cube_tensor_driver.simulation.cubes import compute_frequency_noise
 from cube_tensor_driver.simulation.faults import PAD_FAULTS
 
 from .record import CUT_FAULTS, DRIVER_KILLS, NODE_STARTS, NS_PER_S, HubFault, Span
@@ -152,7 +152,7 @@ class _Evidence:
         self._run = run
         self._noise: list[Array] = []  # Standard deviation of each pad's frequency, in Hz.
         for calibration in run.record.skin.calibrations:
-            self._noise.append(calibration.rest_frequency * frequency_noise(calibration))
+            self._noise.append(calibration.rest_frequency * compute_frequency_noise(calibration))
 
     def find_flagged_span(self, fault: HubFault) -> Span:
         """Return the span of time in which the pad of a fault may be flagged."""

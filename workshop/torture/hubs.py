@@ -122,14 +122,14 @@ class StoringInjector(Injector):
         folder.mkdir()
         self._files = {link.name: (folder / link.name).open("wb") for link in links}
 
-    def measured(
+    def measure(
         self,
         link: SimulatedLink,
         frequency: Millihertz,
         now_us: int,
     ) -> Millihertz:
         """Return the frequencies that a hub measures, and store them with what the hub states."""
-        millihertz = super().measured(link, frequency, now_us)
+        millihertz = super().measure(link, frequency, now_us)
         size = link.size
         reading = np.zeros((), make_reading_type(size.cubes, size.pads))
         # The fault "pads" adds a pad, and no host takes its samples.

@@ -21,7 +21,7 @@ from ...messages.skin_info import (
 )
 from ...messages.touch import make_touch_message
 from ...messages.types import CONTACTS, TOUCH, TRACTION
-from ...touch.contact_finder import ContactFinder, ContactSettings, contact_finder
+from ...touch.contact_finder import ContactFinder, ContactSettings, make_contact_finder
 from ...touch.touch_detection import NO_TOUCHES, Touch, Touches
 from ..metadata import quality
 from ..read import make_message, serialise
@@ -104,7 +104,7 @@ class ContactWriter:
         calibrations = read_cube_calibrations(info)
         self._touch: Touch = Touch(make_recorded_skin(info, calibrations))
         self._info = info
-        self._finder = contact_finder(
+        self._finder = make_contact_finder(
             self._settings,
             read_cube_poses(info),
             calibrations,
@@ -193,7 +193,7 @@ class ContactWriter:
             finder.touch_id,
         )
         self._writer.write(self._contacts, recorded_ns, serialise(CONTACTS, message))
-        cloud = finder.cloud(values) if is_due else None
+        cloud = finder.make_cloud(values) if is_due else None
         if cloud is not None:
             message = make_traction_message(
                 make_message,

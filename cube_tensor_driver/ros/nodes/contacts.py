@@ -22,7 +22,7 @@ from ...core.modes import COMPONENTS
 from ...messages.contacts import make_contacts_message, make_traction_message
 from ...messages.skin_info import read_cube_calibrations, read_skin_elastomer
 from ...msg import SkinContacts, SkinTouch
-from ...touch.contact_finder import ContactFinder, ContactSettings, contact_finder
+from ...touch.contact_finder import ContactFinder, ContactSettings, make_contact_finder
 from ...touch.touch_detection import NO_TOUCHES, Touches
 from ..diagnostics.updater import Diagnostics, make_status
 from ..messages import make_message
@@ -82,7 +82,7 @@ class Contacts(SkinSubscriberNode):
         settings = ContactSettings(**{name: self.read_value(name) for name in names})
         self._finder = None
         self._set_up = partial(
-            contact_finder,
+            make_contact_finder,
             settings,
             skin.poses,
             read_cube_calibrations(skin.info),
@@ -111,7 +111,7 @@ class Contacts(SkinSubscriberNode):
         )
         # Computing the point cloud takes time, so it is done only while somebody subscribes.
         if self._has_traction_listeners():
-            cloud = finder.cloud(values)
+            cloud = finder.make_cloud(values)
             if cloud is not None:
                 message = make_traction_message(
                     make_message,

@@ -49,8 +49,8 @@ class SimulatedImu(CubeNode):
         seconds = 1e-9 * (now_ns - start_ns)
         origin = np.zeros((1, 3))
         axes = np.eye(3)[None]
-        (force,) = self._frame.specific_force(seconds, origin, axes).tolist()
-        velocity = self._frame.angular_velocity(seconds).tolist()
+        (force,) = self._frame.compute_specific_force(seconds, origin, axes).tolist()
+        velocity = self._frame.compute_angular_velocity(seconds).tolist()
         message = self._message
         message.header.stamp = to_time(now_ns)
         a = message.linear_acceleration

@@ -56,7 +56,7 @@ class Polygon(NamedTuple):
     twist: float
 
 
-def hertz_radius(
+def compute_hertz_radius(
     force: float,
     curvature: float,
     stiffness: float,
@@ -138,7 +138,7 @@ def _compute_edge_distances(corners: Array, place: Array) -> Array:
     Returns:
         Distance (K,) from the line of each edge, positive inside, multiplied by the edge's length.
     """
-    edge_x, edge_y = (next_corners(corners) - corners).T
+    edge_x, edge_y = (find_next_corners(corners) - corners).T
     x, y = (place - corners).T
     return np.asarray(edge_x * y - edge_y * x)
 
@@ -152,7 +152,7 @@ def _compute_area_moments(corners: Array) -> tuple[float, Array, float]:
         corners: Corners (K, 2) in m, counterclockwise.
     """
     x, y = corners.T
-    next_x, next_y = next_corners(corners).T
+    next_x, next_y = find_next_corners(corners).T
     double_area = x * next_y - next_x * y
     area = float(double_area.sum() / 2)
     if not area > 0:
@@ -173,7 +173,7 @@ def _compute_area_moments(corners: Array) -> tuple[float, Array, float]:
     return area, centroid, float(polar_about_origin - area * centroid @ centroid)
 
 
-def next_corners(corners: Array) -> Array:
+def find_next_corners(corners: Array) -> Array:
     """Return, for each corner (K, 2) of a polygon, the corner that follows it.
 
     np.roll would take five times as long.

@@ -47,9 +47,9 @@ from ...mechanics.contact_tables import DiscTables, PolygonTables
 from ...mechanics.layer import Layer
 from ..cubes import PadErrors
 from ..imperfections import NONE, Imperfections
-from ..load import ContactLoad, StressField, surface_normal
+from ..load import ContactLoad, StressField, compute_surface_normal
 from ..source import SkinPads
-from .patches import Polygon, hertz_radius, make_flat_contact, next_corners
+from .patches import Polygon, compute_hertz_radius, find_next_corners, make_flat_contact
 
 if TYPE_CHECKING:
     from mujoco import MjData, MjModel
@@ -254,7 +254,7 @@ class MujocoSkin:
         # MuJoCo's normal points from the first body to the second one.
         sign = 2 * side - 1
         place, force, outward = self._find_contact_points(part, rows, sign)
-        normal = surface_normal(
+        normal = compute_surface_normal(
             part.poses,
             part.pitch,
             place.mean(axis=0),
@@ -293,7 +293,7 @@ class MujocoSkin:
             for geom in self.data.contact.geom[rows[0]].tolist()
             if geom >= 0 and model.geom_type[geom] in self._round_kinds
         )
-        radius = hertz_radius(pressing, curvature, self._stiffness)
+        radius = compute_hertz_radius(pressing, curvature, self._stiffness)
         return BodyContact(
             part.body,
             ContactLoad(
@@ -525,7 +525,7 @@ def _compute_field_of_polygons(
     corners, centres, tractions, twists = zip(*polygons, strict=True)
     # Each corner is the start of one edge, the next corner its end.
     starts = np.concatenate(corners)
-    ends = np.concatenate([next_corners(one) for one in corners])
+    ends = np.concatenate([find_next_corners(one) for one in corners])
     n_corners = [len(one) for one in corners]
     number = np.repeat(np.arange(len(polygons)), n_corners)
 

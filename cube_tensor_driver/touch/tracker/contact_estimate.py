@@ -88,7 +88,7 @@ class Discs(NamedTuple):
     log_sizes: Array
 
 
-def discs_of(estimates: Sequence[ContactEstimate]) -> Discs:
+def make_discs(estimates: Sequence[ContactEstimate]) -> Discs:
     """Return round Hertz contacts with the force, position and area of the estimates."""
     forces = np.array([one.force for one in estimates])
     centres = np.array([one.place for one in estimates])

@@ -28,7 +28,7 @@ from ..surface import describe_contact
 from .contact_estimate import ContactEstimate
 from .fitted_field import add_fits
 from .hertz_fit import HertzFit, linearise
-from .local_values import CubeNoise, rotations_about_normal, unroll_points
+from .local_values import CubeNoise, make_rotations_about_normal, unroll_points
 from .node_fit import NodeFit
 from .pressure_regions import PressureRegions
 from .tracked_region import (
@@ -156,9 +156,9 @@ class ContactTracker:
             Contacts, the one with the largest normal force first.
         """
         inverse = self._inverse
-        scaled = inverse.scaled(values)
+        scaled = inverse.scale_values(values)
         self._scaled = scaled
-        self._follow_regions(inverse.depth_pressure_of_scaled(scaled), certain)
+        self._follow_regions(inverse.compute_depth_pressure_of_scaled(scaled), certain)
         regions = self._regions
         self._noise.update(scaled, self._fitted_cubes)
         for region in regions:
@@ -166,7 +166,7 @@ class ContactTracker:
         self._update_fits()
 
         if len(self._fits) < len(regions):
-            self._integrate_field(inverse.field_of_scaled(scaled))
+            self._integrate_field(inverse.compute_field_of_scaled(scaled))
         if max_work > 0:
             self._improve_fits(max_work)
 
@@ -205,7 +205,9 @@ class ContactTracker:
 
         It is computed when it is read, which takes several milliseconds for each contact.
         """
-        residual = self._inverse.field_of_scaled(self._scaled - self._response_to_fits())
+        residual = self._inverse.compute_field_of_scaled(
+            self._scaled - self._compute_response_to_fits()
+        )
         contacts, _ = add_fits(self._inverse, self._fits)
         pairs = zip(residual, contacts, strict=True)
         return TractionField(*(one + other for one, other in pairs))
@@ -220,13 +222,13 @@ class ContactTracker:
             values: Components (cubes, 15) in Pa and Pa/m that the last `update` was called with.
         """
         inverse = self._inverse
-        residual = self._scaled - self._response_to_fits()
-        deviation = inverse.residual_deviation(residual, inverse.scaled(values))
+        residual = self._scaled - self._compute_response_to_fits()
+        deviation = inverse.compute_residual_deviation(residual, inverse.scale_values(values))
         _, contacts = add_fits(inverse, self._fits)
         pairs = zip(deviation, contacts, strict=True)
         return FieldDeviation(*(np.hypot(one, other) for one, other in pairs))
 
-    def _response_to_fits(self) -> Array:
+    def _compute_response_to_fits(self) -> Array:
         """Return the response of all cubes to the traction of all fits.
 
         It consists of the C components of stress and gradient (times d0, half the side of a cube)
@@ -407,7 +409,7 @@ class ContactTracker:
         pressing = weight * field.depth_pressure[own]
         normal_force = float(pressing.sum())
         _, angle = inverse.unroll(region.home, inverse.cube[own])
-        from_home = rotations_about_normal(angle)
+        from_home = make_rotations_about_normal(angle)
         traction = np.einsum("nba,nb->na", from_home, field.traction[own])
         force = weight @ traction
         force[2] = -normal_force
@@ -452,7 +454,7 @@ class ContactTracker:
         offset = estimate.place - places
         squared_distance = (offset**2).sum(axis=1)
         cube = int(squared_distance.argmin())
-        to_cube = rotations_about_normal(angles[cube])
+        to_cube = make_rotations_about_normal(angles[cube])
         rotation = inverse.poses.rotation[cube]
         local = to_cube[:2, :2] @ offset[cube]
         from_cube = np.array([*local, inverse.depth])

@@ -18,7 +18,7 @@ from ...mechanics.layer import FIELD
 from ..inverse import FieldDeviation, SurfaceInverse, TractionField
 from .contact_estimate import ContactSum
 from .hertz_fit import HertzFit
-from .local_values import LocalValues, rotations_about_normal, unroll_points
+from .local_values import LocalValues, make_rotations_about_normal, unroll_points
 from .node_fit import NodeFit
 
 _MIN_RINGS = 4
@@ -111,5 +111,5 @@ def _distribute(
     below_by_force = below.reshape(n_points, -1)
 
     _, angle = inverse.unroll(values.home, inverse.cube[points])
-    rotation = rotations_about_normal(angle)
+    rotation = make_rotations_about_normal(angle)
     return points, share, below_by_force, rotation

@@ -27,7 +27,7 @@ from ...mechanics.contact_response import DISC_SIZES
 from ...mechanics.sensitivity import DEPTH_DEVIATION
 from ..inverse import SurfaceInverse
 from .contact_estimate import ContactEstimate, ContactSum, Discs
-from .local_values import LocalValues, rotations_about_normal
+from .local_values import LocalValues, make_rotations_about_normal
 
 SIZE_DEVIATION = 1.0
 """Prior standard deviation of the natural logarithm of the radius of a Hertz contact."""
@@ -193,7 +193,7 @@ class HertzFit:
         self._contact_precision = np.tile(precision, n_contacts)
         self._elastomer_errors = np.zeros(1)  # the first error is that of the depth
 
-    def prior_precision(self, quantities: int) -> Array:
+    def compute_prior_precision(self, quantities: int) -> Array:
         """Return the prior precisions (p,) of the parameters for the next linearisation.
 
         Args:
@@ -308,7 +308,7 @@ class HertzFit:
         is_home = self.values.cubes == values.home
         (number,) = np.flatnonzero(is_home)
         place = self.values.place[number]
-        to_home = rotations_about_normal(self.values.angle[number])
+        to_home = make_rotations_about_normal(self.values.angle[number])
         to_home_in_plane = to_home[:2, :2]
 
         def transform(discs: Discs) -> Discs:
@@ -553,7 +553,7 @@ def _linearise_alike(
     white_values = white_values.reshape(n_fits, -1)
 
     quantities = sensitivity.shape[1]
-    precision = np.stack([fit.prior_precision(quantities) for fit in fits])
+    precision = np.stack([fit.compute_prior_precision(quantities) for fit in fits])
     usual_size = USUAL_SIZE * inverse.depth
     prior_offset = np.zeros_like(precision)
     n_contact_parameters = _N_PARAMETERS * contacts

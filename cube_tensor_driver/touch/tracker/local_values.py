@@ -12,7 +12,7 @@ import numpy as np
 
 from ...core.arrays import Array, Index, Mask
 from ..inverse import SurfaceInverse
-from ..pad_noise import GAIN_ERROR, regularise, stress_matrices
+from ..pad_noise import GAIN_ERROR, make_stress_matrices, regularise
 
 MIN_FACING = 0.5
 """Smallest cosine of the angle between the outward normals of two cubes at which one of them
@@ -128,7 +128,7 @@ class CubeNoise:
         known_by_pad = np.where(is_known, by_pad, 0.0)
         self.known[cubes] = known
         self._by_pad[cubes] = known_by_pad
-        self._to_pads[cubes] = stress_matrices(by_pad, known)
+        self._to_pads[cubes] = make_stress_matrices(by_pad, known)
         self._variance[cubes] = 0.0
 
     def _whiten(self, cubes: Index, variance: Array) -> None:
@@ -224,7 +224,7 @@ class LocalValues:
         weight = 1 / np.sqrt(total_variance)
         self.whitening = whitening * weight[:, None, None]
 
-    def nearest_cubes(self, places: Array) -> Index:
+    def find_nearest_cubes(self, places: Array) -> Index:
         """Return the indices (J,) of the cubes nearest to places (J, 2) on the skin laid flat."""
         offset = places[:, None] - self.place
         squared_distance = (offset**2).sum(axis=2)
@@ -317,7 +317,7 @@ class LocalValues:
         return np.asarray(total.swapaxes(1, 2), float)
 
 
-def rotations_about_normal(angle: Array) -> Array:
+def make_rotations_about_normal(angle: Array) -> Array:
     """Return the matrices (..., 3, 3) from one frame to another that is rotated about z.
 
     Args:

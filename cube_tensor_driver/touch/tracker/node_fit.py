@@ -41,8 +41,8 @@ from .contact_estimate import (
     ContactEstimate,
     ContactSum,
     Discs,
-    discs_of,
     estimate_contact,
+    make_discs,
     moment_polynomials,
 )
 from .local_values import LocalValues, unroll_points
@@ -299,7 +299,7 @@ class NodeFit:
     @property
     def discs(self) -> Discs:
         """Round Hertz contacts that act on distant cubes like the traction on the nodes."""
-        return discs_of(self.estimate_contacts())
+        return make_discs(self.estimate_contacts())
 
     def estimate_contacts(self) -> list[ContactEstimate]:
         """Return force, centre, moment and area of each contact of the region, by integration."""

@@ -17,7 +17,7 @@ import numpy as np
 
 from ...core.arrays import Array, Index
 from ..inverse import SurfaceInverse
-from .contact_estimate import ContactEstimate, Discs, discs_of
+from .contact_estimate import ContactEstimate, Discs, make_discs
 from .hertz_fit import HertzFit, linearise
 from .local_values import MIN_FACING, CubeNoise, LocalValues
 from .node_fit import MAX_NODES, NODE_STEP, NodeFit
@@ -290,7 +290,7 @@ class TrackedRegion:
         inverse = self._inverse
         values = fit.values
         found = fit.found
-        below = values.nearest_cubes(found.centres)
+        below = values.find_nearest_cubes(found.centres)
         if not (self._is_around[below] & (found.forces[:, 2] < 0)).all():
             self.fit = None
             return
@@ -298,7 +298,7 @@ class TrackedRegion:
         mean_centre = found.centres.sum(axis=0) / len(below)
         from_home = np.hypot(*mean_centre)
         if from_home > HOME_PITCHES * inverse.pitch:
-            home = int(values.nearest_cubes(mean_centre[None])[0])
+            home = int(values.find_nearest_cubes(mean_centre[None])[0])
             if home != values.home:
                 centre_cubes = np.append(below, home)
                 cubes = np.unique(inverse.near[centre_cubes])
@@ -365,9 +365,9 @@ class TrackedRegion:
         squared_radius = self.integral.area / np.pi - depth**2
         largest = MAX_START_SIZE * depth
         squared_radius = np.clip(squared_radius, (depth / 2) ** 2, largest**2)
-        return discs_of([self.integral._replace(area=np.pi * squared_radius)])
+        return make_discs([self.integral._replace(area=np.pi * squared_radius)])
 
-    def stale_cubes(self, cubes: Index) -> Index:
+    def find_stale_cubes(self, cubes: Index) -> Index:
         """Return those of some cubes for which the stored response to this region is out of date.
 
         If the contacts of the region have changed by more than `MAX_STALE_CHANGE` since responses
@@ -598,7 +598,7 @@ class TrackedRegion:
         largest_aspect = max(one.aspect for one in starts)
         if largest_aspect > MAX_HERTZ_ASPECT:
             return
-        discs = discs_of(starts)
+        discs = make_discs(starts)
         largest_size = MAX_START_SIZE * self._inverse.depth
         log_sizes = np.minimum(discs.log_sizes, np.log(largest_size))
         discs = discs._replace(log_sizes=log_sizes)
@@ -642,7 +642,7 @@ def update_responses(
         regions: Regions whose `response` is computed.
         cubes: Indices (n,) of the cubes.
     """
-    stale = [(region, region.stale_cubes(cubes)) for region in regions]
+    stale = [(region, region.find_stale_cubes(cubes)) for region in regions]
     stale = [(region, own) for region, own in stale if len(own)]
     if stale:
         _update_stale_responses(inverse, stale)
