@@ -33,7 +33,11 @@ def ends_at_once() -> Iterator[None]:
     watched, written = os.pipe()
     os.set_blocking(written, False)
     before = signal.set_wakeup_fd(written, warn_on_full_buffer=False)
-    watcher = threading.Thread(target=_end_on_interrupt, args=(watched,), daemon=True)
+    watcher = threading.Thread(
+        target=_end_on_interrupt,
+        args=(watched,),
+        daemon=True,
+    )
     watcher.start()
     try:
         yield

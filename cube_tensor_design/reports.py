@@ -107,7 +107,13 @@ def _show_response(result: Response) -> None:
         numbers = result.matrix[:, start : start + count]
         left = [f"{100 * result.mode_residual[name]:.2f}" for name in names]
         rows = _make_rows(labels, numbers, 4)
-        print_table(("pad",), names, rows, title=title, footer=[["left, %", *left]])
+        print_table(
+            ("pad",),
+            names,
+            rows,
+            title=title,
+            footer=[["left, %", *left]],
+        )
         title = ""
     _show_convergence(result)
     hidden = len(result.coefficients) - MAX_COEFFICIENTS_SHOWN
@@ -160,7 +166,11 @@ def write(path: Path, result: Result, command: str, model: Model) -> None:
         write_influence(path, result.influence, command)
         print(f"wrote {path}")
     elif isinstance(result, ThermalStress):
-        write_yaml(path, result.to_dict(), f"Made by: {command} -o {path}\n{THERMAL_HEADER}")
+        write_yaml(
+            path,
+            result.to_dict(),
+            f"Made by: {command} -o {path}\n{THERMAL_HEADER}",
+        )
         print(f"wrote {path}")
     elif model.calibration is not None:
         _write_weight(path, result, command, model.calibration)
@@ -176,7 +186,12 @@ def _write_response(
     # A body without the symmetry would lose a part of its response in the coefficients.
     needs_matrix = result.structure_residual > MAX_STRUCTURE_RESIDUAL
     source = f"computed by {command}"
-    calibration = make_calibration_from_fem(result, needs_matrix, neglect, source)
+    calibration = make_calibration_from_fem(
+        result,
+        needs_matrix,
+        neglect,
+        source,
+    )
     # A pad is crushed where its stress reaches the modulus of its foam.
     to_pressure = result.matrix[:, result.modes.index("zz")]
     largest = np.abs(to_pressure).max()

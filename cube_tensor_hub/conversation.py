@@ -215,7 +215,9 @@ class Conversation:
         self._ask("unknown request", Request(UNKNOWN, ANY_ARGUMENT))
         self._send_bytes("damaged", _make_damaged_requests(), AFTER_DAMAGE)
         self._send_bytes(
-            "wrong way", b"".join(map(encode, _make_frames_of_hubs())), AFTER_WRONG_WAY
+            "wrong way",
+            b"".join(map(encode, _make_frames_of_hubs())),
+            AFTER_WRONG_WAY,
         )
         self._send_bytes("XOFF", XOFF, Command.STOP)
         # A hub with flow control would stay silent for the rest of the check without an XON.
@@ -227,25 +229,49 @@ class Conversation:
         self._ask("after impossible period", Command.HELLO)
         self._ask("period", Request(Command.SET_PERIOD, PERIOD_US))
         self._ask("after period", Command.HELLO)
-        self._ask("start", Request(Command.START, ANY_ARGUMENT), seconds=FLOW_S)
+        self._ask(
+            "start",
+            Request(Command.START, ANY_ARGUMENT),
+            seconds=FLOW_S,
+        )
         self._ask_time("started")
         # Each START comes at another phase of the sample period.
         for number in range(3):
-            self._ask(f"start again {number}", Command.START, seconds=BETWEEN_START_S)
-        self._ask("refused while started", Request(Command.SET_PERIOD, 0), seconds=STOPPED_S)
-        self._ask("slower", Request(Command.SET_PERIOD, SLOWER_US), seconds=NEW_PERIOD_S)
+            self._ask(
+                f"start again {number}",
+                Command.START,
+                seconds=BETWEEN_START_S,
+            )
+        self._ask(
+            "refused while started",
+            Request(Command.SET_PERIOD, 0),
+            seconds=STOPPED_S,
+        )
+        self._ask(
+            "slower",
+            Request(Command.SET_PERIOD, SLOWER_US),
+            seconds=NEW_PERIOD_S,
+        )
         self._ask("stop samples", Command.STOP, seconds=STOPPED_S)
         self._ask("stop again", Command.STOP)
         self._ask("start after stop", Command.START, seconds=SECOND_S)
 
     def _stop_reading(self) -> None:
         """Let buffers overflow without reading, then close and open the port."""
-        self._ask("fast", Request(Command.SET_PERIOD, FAST_US), seconds=SECOND_S)
+        self._ask(
+            "fast",
+            Request(Command.SET_PERIOD, FAST_US),
+            seconds=SECOND_S,
+        )
         # At this rate the buffers overflow while nobody reads.
         self._begin("unread")
         self._wire.ignore(UNREAD_S)
         self._listen(GRACE_S)
-        self._ask("period again", Request(Command.SET_PERIOD, PERIOD_US), seconds=SETTLE_S)
+        self._ask(
+            "period again",
+            Request(Command.SET_PERIOD, PERIOD_US),
+            seconds=SETTLE_S,
+        )
         self._begin("gone")
         self._wire.reopen(AWAY_S)
         self._listener.reopen()
@@ -313,7 +339,11 @@ class Conversation:
         self._transcript.steps[name] = self._step
         return self._step
 
-    def _listen(self, seconds: float, enough: Callable[[], bool] = lambda: False) -> None:
+    def _listen(
+        self,
+        seconds: float,
+        enough: Callable[[], bool] = lambda: False,
+    ) -> None:
         """Add the frames that come to the step, for a time in seconds, or until `enough()`."""
         step = self._step
         until = self._wire.now() + seconds

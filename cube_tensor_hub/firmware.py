@@ -94,7 +94,11 @@ class Emulator:
         pads: Socket of the line over which the hub asks for captures of its pads.
     """
 
-    def __init__(self, image: Path, address: tuple[str, int] = ANY_ADDRESS) -> None:
+    def __init__(
+        self,
+        image: Path,
+        address: tuple[str, int] = ANY_ADDRESS,
+    ) -> None:
         """Prepare the hub.
 
         Args:

@@ -48,7 +48,12 @@ class PortWire:
         while (left := until - self.now()) > 0:
             # Bytes for which the kernel had no room are sent as soon as it has.
             waiting = [self._link.fileno()] if self._link.unsent else []
-            readable, writable, _ = select.select([self._link.fileno()], waiting, [], left)
+            readable, writable, _ = select.select(
+                [self._link.fileno()],
+                waiting,
+                [],
+                left,
+            )
             if writable:
                 self._link.flush()
             if readable:

@@ -86,13 +86,25 @@ def run(options: argparse.Namespace) -> int:
     # The factorisation runs in C, where Ctrl-C would not be noticed.
     with ends_at_once(), show_progress_bar() as report:
         if options.load == "surface":
-            result = study_surface(body, layout, meshes, model.neglect, report)
+            result = study_surface(
+                body,
+                layout,
+                meshes,
+                model.neglect,
+                report,
+            )
         elif options.load == "temperature":
             result = compute_thermal_stress(body, layout, meshes, report)
         elif options.load == "weight":
             result = compute_weight(body, layout, meshes, report)
         else:
-            result = compute_response(body, layout, model.symmetry, meshes, report)
+            result = compute_response(
+                body,
+                layout,
+                model.symmetry,
+                meshes,
+                report,
+            )
     if options.json is not None:
         write_json(options.json, result.to_dict())
     reports.show(result)

@@ -136,7 +136,13 @@ def compute_response(
         SymmetryError: The layout does not have the symmetry.
     """
     structure = find_structure(layout, symmetry)
-    results = solve_meshes(body, layout, meshes, partial(load_modes, layout=layout), progress)
+    results = solve_meshes(
+        body,
+        layout,
+        meshes,
+        partial(load_modes, layout=layout),
+        progress,
+    )
     changes = [result.change for result in results[1:]]
     rows = []
     for result, change in zip(results, [*changes, None], strict=True):
@@ -260,7 +266,11 @@ def _compute_mode_residual(
 ) -> dict[str, float]:
     """Return, by mode, the part of its column of the response that the symmetric coefficients do
     not explain: norm of the difference over norm of the column."""
-    explained = np.tensordot(list(coefficients.values()), structure.basis, axes=1)
+    explained = np.tensordot(
+        list(coefficients.values()),
+        structure.basis,
+        axes=1,
+    )
     left = np.linalg.norm(matrix - explained, axis=0)
     norms = np.linalg.norm(matrix, axis=0)
     relative = left / np.where(norms > 0, norms, 1.0)

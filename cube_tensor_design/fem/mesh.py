@@ -79,7 +79,11 @@ def mesh_quarter(
     centres = base.p[:, base.t].mean(axis=1)
     from_corner = np.abs(centres - 1.0)
     outside_rings = np.any(from_corner > rho, axis=0)
-    ring_points, ring_triangles = _make_rings(rho, 0.25 if level == 0 else 0.5, smallest)
+    ring_points, ring_triangles = _make_rings(
+        rho,
+        0.25 if level == 0 else 0.5,
+        smallest,
+    )
     points = np.concatenate([base.p.T, ring_points])
     # The points of the rings are numbered after those of the grid.
     ring_triangles = ring_triangles + base.nvertices

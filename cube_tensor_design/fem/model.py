@@ -128,7 +128,12 @@ def read_model(name: str | None) -> Model:
     """
     if name is None:
         return _build_model({}, Path())
-    path = find_shipped("fem/*.yaml", name, Path(), "a model file, or one of the shipped models")
+    path = find_shipped(
+        "fem/*.yaml",
+        name,
+        Path(),
+        "a model file, or one of the shipped models",
+    )
     data = read_yaml(path) or {}
     for _, mistake in _SCHEMA.find_mistakes(data):
         raise ConfigError(f"{path}: {mistake}")
@@ -196,7 +201,11 @@ def _place_pads(
     try:
         if "centre" not in pads:
             return Layout(layout.name, layout.positions, layout.normals, size)
-        return strip_layout(layout, size, round(pads["centre"] / half_side, 12))
+        return strip_layout(
+            layout,
+            size,
+            round(pads["centre"] / half_side, 12),
+        )
     except LayoutError as error:
         raise ElasticError(
             f"pads of {1e3 * width:g} mm: {error}, on a cube whose faces end at "

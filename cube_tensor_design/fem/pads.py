@@ -89,7 +89,13 @@ def pad_weights(
                 stop = min(centre[k] + half, 1.0)
                 rounded = np.round(positions[k, dofs], 14)
                 nodes, index = np.unique(rounded, return_inverse=True)
-                integral = compute_interval_weights(nodes, order, parity[k], start, stop)
+                integral = compute_interval_weights(
+                    nodes,
+                    order,
+                    parity[k],
+                    start,
+                    stop,
+                )
                 product *= integral[index] / (stop - start)
             weights[pad, dofs] = product
     return weights

@@ -67,7 +67,10 @@ def compute_influence(
     )
 
 
-def _compute_surface_influence(solid: Solid, layout: Layout) -> tuple[Array, Array]:
+def _compute_surface_influence(
+    solid: Solid,
+    layout: Layout,
+) -> tuple[Array, Array]:
     """Return positions (n, dim - 1) of the nodes on the surface, and the stress (P, n, dim) of P
     pads under unit forces there; lengths in d0 (half the side of the cube)."""
     dim = solid.dim

@@ -185,7 +185,11 @@ class Solid:
         if cube is not None:
             self.total = self.body + stiffness(self.select_elements(in_cube=True), cube)
 
-    def compute_outer_forces(self, parity: Parity, field: Callable[[Array], Array]) -> Array:
+    def compute_outer_forces(
+        self,
+        parity: Parity,
+        field: Callable[[Array], Array],
+    ) -> Array:
         """Return the nodal forces (dofs, n) of n fields that act as tractions on the outer faces.
 
         Args:
@@ -203,7 +207,12 @@ class Solid:
             if end < SAME_COORDINATE:
                 continue  # a mirror
             outer = edges[_is_at(sign * centres[axis], end)]
-            face = skfem.FacetBasis(mesh, self.basis.elem, facets=outer, intorder=6)
+            face = skfem.FacetBasis(
+                mesh,
+                self.basis.elem,
+                facets=outer,
+                intorder=6,
+            )
             x = np.asarray(face.default_parameters()["x"])
             points = x.reshape(self.dim, -1).T
             stress = _select_parity_part(field, points, parity)

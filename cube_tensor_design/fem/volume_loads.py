@@ -137,7 +137,12 @@ def compute_thermal_stress(
 
     results = solve_meshes(body, layout, meshes, load, progress)
     finest = results[-1]
-    return ThermalStress(body, layout, body.young * finest.pads, finest.change)
+    return ThermalStress(
+        body,
+        layout,
+        body.young * finest.pads,
+        finest.change,
+    )
 
 
 def compute_weight(

@@ -91,7 +91,11 @@ def _draw_pads(axis: Axes, layout: Layout, half_side: float) -> None:
     axis.plot(x.T, z.T, color="tab:red", linewidth=5, solid_capstyle="butt")
 
 
-def _draw_deformation(axis: Axes, deformation: Deformation, window: float) -> float:
+def _draw_deformation(
+    axis: Axes,
+    deformation: Deformation,
+    window: float,
+) -> float:
     """Draw σzz on the deformed body within `window` d0, the cube, and displacements as arrows.
 
     Returns:
@@ -109,7 +113,14 @@ def _draw_deformation(axis: Axes, deformation: Deformation, window: float) -> fl
     _draw_arrows(axis, deformation, window)
 
     # The cube before the deformation is dotted, and after it white.
-    square = Rectangle((-mm, -mm), 2 * mm, 2 * mm, fill=False, linestyle=":", linewidth=0.8)
+    square = Rectangle(
+        (-mm, -mm),
+        2 * mm,
+        2 * mm,
+        fill=False,
+        linestyle=":",
+        linewidth=0.8,
+    )
     axis.add_patch(square)
     face = np.flatnonzero(np.isclose(np.abs(points).max(axis=0), 1))
     x, z = points[:, face]
@@ -123,7 +134,12 @@ def _draw_deformation(axis: Axes, deformation: Deformation, window: float) -> fl
     return scale
 
 
-def _draw_stress(axis: Axes, deformation: Deformation, drawn: Array, is_near: Mask) -> None:
+def _draw_stress(
+    axis: Axes,
+    deformation: Deformation,
+    drawn: Array,
+    is_near: Mask,
+) -> None:
     """Draw σzz of the elastomer as colours and contour lines on the points `drawn` (2, n), mm.
 
     The colour scale follows the stress of the points that are near the cube.
@@ -141,10 +157,21 @@ def _draw_stress(axis: Axes, deformation: Deformation, drawn: Array, is_near: Ma
     limit = np.percentile(magnitude, COLOUR_PERCENTILE)
 
     mesh = Triangulation(drawn[0], drawn[1], triangles.T)
-    image = axis.tripcolor(mesh, kilopascal, shading="gouraud", cmap=SIGNED_COLOURS)
+    image = axis.tripcolor(
+        mesh,
+        kilopascal,
+        shading="gouraud",
+        cmap=SIGNED_COLOURS,
+    )
     image.set_clim(-limit, limit)
     # matplotlib dashes the lines below zero.
-    lines = axis.tricontour(mesh, kilopascal, limit * CONTOURS, colors="black", linewidths=0.7)
+    lines = axis.tricontour(
+        mesh,
+        kilopascal,
+        limit * CONTOURS,
+        colors="black",
+        linewidths=0.7,
+    )
     label = r"$\sigma_{zz}$ / kPa (dashed: negative)"
     colorbar = axis.figure.colorbar(image, ax=axis, label=label)
     colorbar.add_lines(lines)

@@ -91,8 +91,18 @@ def _draw_modes(axis: Axes, result: Experiment, modes: slice) -> None:
     # matplotlib puts no label with an underscore into the legend.
     hidden = [f"_{label}" for label in labels]
     x = result.displacement
-    draw_curves(axis, x, dict(zip(labels, recovered.T, strict=True)), linestyle="-")
-    draw_curves(axis, x, dict(zip(hidden, truth.T, strict=True)), linestyle="--")
+    draw_curves(
+        axis,
+        x,
+        dict(zip(labels, recovered.T, strict=True)),
+        linestyle="-",
+    )
+    draw_curves(
+        axis,
+        x,
+        dict(zip(hidden, truth.T, strict=True)),
+        linestyle="--",
+    )
     # Rounding errors of modes that are zero must not fill a panel.
     floor = MIN_SHOWN_SHARE * np.abs(result.recovered).max()
     if np.abs([recovered, truth]).max() < floor:
@@ -112,7 +122,11 @@ def draw_rod_parts(found: dict[str, RodParts]) -> Figure:
     axes = figure.subplots(1, len(strips), sharey=True)
     for axis, (name, one) in zip(axes, strips.items(), strict=True):
         curves = np.vstack([one.signal, one.parts.T])
-        draw_curves(axis, one.place, dict(zip(PART_LABELS, curves, strict=True)))
+        draw_curves(
+            axis,
+            one.place,
+            dict(zip(PART_LABELS, curves, strict=True)),
+        )
         axis.set(title=name, xlabel=ROD_LABEL)
     axes[0].set_ylabel("$-v_1 + v_2 + v_3 - v_4$ / kPa")
     add_legend_below(figure)
@@ -146,8 +160,16 @@ def draw_prototype(experiments: Sequence[Experiment]) -> Figure:
         names = (*SIGNAL_LABELS[1:], UPPER_LABEL)
         curves = (shear, gradient, -shear)
         # P_normal is some thirty times as large as the others, which have an axis of their own.
-        draw_curves(upper, experiment.displacement, {SIGNAL_LABELS[0]: normal})
-        draw_curves(lower, experiment.displacement, dict(zip(names, curves, strict=True)))
+        draw_curves(
+            upper,
+            experiment.displacement,
+            {SIGNAL_LABELS[0]: normal},
+        )
+        draw_curves(
+            lower,
+            experiment.displacement,
+            dict(zip(names, curves, strict=True)),
+        )
         upper.set_title(experiment.name, fontsize=8)
         lower.set_xlabel("displacement / mm")
     for axis in axes[:, 0]:

@@ -72,7 +72,11 @@ def draw_traction(example: FieldExample) -> Figure:
     }
     image = _draw_maps(axes.flat[4:], example, errors)
     # A colour bar of the whole row keeps the columns of both rows aligned.
-    figure.colorbar(image, ax=axes[1], label="error and predicted\ndeviation / kPa")
+    figure.colorbar(
+        image,
+        ax=axes[1],
+        label="error and predicted\ndeviation / kPa",
+    )
     return figure
 
 
@@ -81,12 +85,28 @@ def compute_relative_rms(values: Array, reference: Array) -> float:
     return float(np.linalg.norm(values) / np.linalg.norm(reference))
 
 
-def _make_map_panels(figure: Figure, rows: int, columns: int) -> NDArray[np.object_]:
+def _make_map_panels(
+    figure: Figure,
+    rows: int,
+    columns: int,
+) -> NDArray[np.object_]:
     """Return panels (rows, columns) for maps of the same square, with labels at the outer ones."""
-    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    axes = figure.subplots(
+        rows,
+        columns,
+        sharex=True,
+        sharey=True,
+        squeeze=False,
+    )
     view = (-VIEW_MM, VIEW_MM)
     for axis in axes.flat:
-        axis.set(aspect="equal", xlim=view, ylim=view, xlabel="$x$ / mm", ylabel="$y$ / mm")
+        axis.set(
+            aspect="equal",
+            xlim=view,
+            ylim=view,
+            xlabel="$x$ / mm",
+            ylabel="$y$ / mm",
+        )
         axis.grid(False)
         axis.label_outer()
     return axes
@@ -106,13 +126,40 @@ def _draw_maps(
     for axis, (title, values) in zip(axes, maps.items(), strict=True):
         # A method may compute tension, which no contact makes.
         kilopascal = 1e-3 * np.maximum(values, 0)
-        image: TriMesh = axis.tripcolor(x, y, kilopascal, vmin=0, vmax=top, shading="gouraud")
+        image: TriMesh = axis.tripcolor(
+            x,
+            y,
+            kilopascal,
+            vmin=0,
+            vmax=top,
+            shading="gouraud",
+        )
         image.set_rasterized(True)
-        axis.tricontour(x, y, kilopascal, levels=levels, colors="white", linewidths=0.5)
+        axis.tricontour(
+            x,
+            y,
+            kilopascal,
+            levels=levels,
+            colors="white",
+            linewidths=0.5,
+        )
         axis.plot(*cubes, "s", ms=4, mfc="none", mec="0.8", label="cube")
-        axis.plot(*load, "P", ms=7, mfc="red", mec="white", mew=0.8, label="load")
+        axis.plot(
+            *load,
+            "P",
+            ms=7,
+            mfc="red",
+            mec="white",
+            mew=0.8,
+            label="load",
+        )
         axis.set_title(title)
-    axes[0].legend(fontsize=7, loc="lower left", facecolor="0.3", labelcolor="white")
+    axes[0].legend(
+        fontsize=7,
+        loc="lower left",
+        facecolor="0.3",
+        labelcolor="white",
+    )
     return image
 
 
@@ -131,9 +178,18 @@ def draw_field_study(study: FieldStudy) -> Figure:
             style = choose_curve_style(row) | {"linestyle": "-"}
             errors = study.error[row]
             axis.loglog(pitches, errors[:, 0], **style | {"linestyle": "--"})
-            axis.loglog(pitches, errors[:, kind], label=f"{1e3 * width:.0f} mm", **style)
+            axis.loglog(
+                pitches,
+                errors[:, kind],
+                label=f"{1e3 * width:.0f} mm",
+                **style,
+            )
         axis.set(xlabel="pitch of the cubes / mm", title=title)
-        axis.set_xticks(pitches, [f"{pitch:.0f}" for pitch in pitches], minor=False)
+        axis.set_xticks(
+            pitches,
+            [f"{pitch:.0f}" for pitch in pitches],
+            minor=False,
+        )
         axis.minorticks_off()
     # Both panels share the legend: their widths have the same colours and markers.
     axes[0].set_ylabel("rms error / rms pressure")

@@ -74,7 +74,12 @@ def _draw_load(axis: Axes, state: dict[str, float]) -> None:
         axis.annotate("", xy=tip, xytext=tail, arrowprops=style)
 
 
-def _draw_cube(axis: Axes, layout: Layout, pads: Array, colours: ScalarMappable) -> None:
+def _draw_cube(
+    axis: Axes,
+    layout: Layout,
+    pads: Array,
+    colours: ScalarMappable,
+) -> None:
     """Draw pads on the section of the cube in the colour and with the number of their stress."""
     centres = layout.positions[:, [0, 2]]
     normals = layout.normals[:, [0, 2]]
@@ -108,7 +113,12 @@ def draw_sweep(sweep: Sweep) -> Figure:
     tangent = {"value and slope at a cube": sweep.value + sweep.slope * near}
     draw_curves(left, near, tangent, color="tab:red", linewidth=3, marker="")
     left.plot(0, 1e-3 * sweep.value, "s", color="tab:red")
-    left.axvline(1e3 * BALL_X, color="0.6", ls=":", label="the ball presses here")
+    left.axvline(
+        1e3 * BALL_X,
+        color="0.6",
+        ls=":",
+        label="the ball presses here",
+    )
     left.set(xlabel="$x$ / mm", ylabel="$\\sigma_{zz}$ / kPa")
     curves = {"true": sweep.truth, "eight pads": sweep.cube, "two upper pads": sweep.pair}
     draw_curves(right, sweep.place, curves, spacing=16)

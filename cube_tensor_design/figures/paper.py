@@ -53,7 +53,11 @@ def save_paper(folder: Path, report: Progress) -> list[Path]:
     save_picture(draw_rod_parts(parts), "rod_parts")
     numbers["rod parts"] = {name: vars(one) for name, one in parts.items()}
     report_held = _report_part(report, "rod, held force")
-    parts = split_rod_signals(places=NEAR_PLACES, held="force", progress=report_held)
+    parts = split_rod_signals(
+        places=NEAR_PLACES,
+        held="force",
+        progress=report_held,
+    )
     numbers["rod parts, held force"] = {name: vars(one) for name, one in parts.items()}
 
     recovered = recover_rod_shear(progress=_report_part(report, "shear"))

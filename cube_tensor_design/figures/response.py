@@ -47,7 +47,11 @@ def draw_convergence(result: Response) -> Figure:
     shown = sorted(values, key=lambda name: -abs(values[name]))[:MAX_COEFFICIENTS]
     for number, name in enumerate(shown):
         change = np.array([row["coefficients"][name] - values[name] for row in coarser])
-        (curve,) = axis.loglog(unknowns, 100 * abs(change) / largest, label=name)
+        (curve,) = axis.loglog(
+            unknowns,
+            100 * abs(change) / largest,
+            label=name,
+        )
         curve.set(**choose_curve_style(number))
     label = f"distance from the result with {finest['unknowns']} unknowns / % of the largest"
     axis.set(xlabel="unknowns of the mesh", ylabel=label)
@@ -83,8 +87,20 @@ def draw_response(result: Response) -> Figure:
             # The colour map is dark below zero.
             color = "black" if value > -0.1 * limit else "white"
             text = f"{value:.2f}"
-            axis.text(mode, pad, text, ha="center", va="center", fontsize=7, color=color)
-    figure.colorbar(image, ax=axis, label="pad stress over amplitude of the mode / (Pa/Pa)")
+            axis.text(
+                mode,
+                pad,
+                text,
+                ha="center",
+                va="center",
+                fontsize=7,
+                color=color,
+            )
+    figure.colorbar(
+        image,
+        ax=axis,
+        label="pad stress over amplitude of the mode / (Pa/Pa)",
+    )
     return figure
 
 

@@ -38,7 +38,13 @@ def draw_trust(result: LayoutStudy) -> Figure:
     rows = len(result.sides)
     columns = len(result.error)
     figure = Figure(figsize=(4 * columns, 3 * rows))
-    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    axes = figure.subplots(
+        rows,
+        columns,
+        sharex=True,
+        sharey=True,
+        squeeze=False,
+    )
     for by_side, (name, error) in zip(axes.T, result.error.items(), strict=True):
         for axis, side, errors in zip(by_side, result.sides, error, strict=True):
             _draw_errors(axis, 1e3 * result.widths, errors)
@@ -72,7 +78,11 @@ def _draw_errors(axis: Axes, widths: Array, errors: Array) -> None:
     for number, component in enumerate(COMPONENTS):
         is_observed = not np.isnan(errors[0, number])
         if is_observed:
-            (curve,) = axis.loglog(widths, errors[:, number], label=format_symbol(component))
+            (curve,) = axis.loglog(
+                widths,
+                errors[:, number],
+                label=format_symbol(component),
+            )
             curve.set(**_choose_component_style(number))
 
 

@@ -215,13 +215,19 @@ def compute_figure_4() -> dict[str, Deformation]:
     return _compute_deformations(VirtualBench(Body(), size=0.2), ("zx", "zz_x"))
 
 
-def compute_mode_deformations(body: Body, layout: Layout) -> dict[str, Deformation]:
+def compute_mode_deformations(
+    body: Body,
+    layout: Layout,
+) -> dict[str, Deformation]:
     """Return the section deformed by `MODE_AMPLITUDE` of each plane mode (linear stress field), by
     the mode's name."""
     return _compute_deformations(VirtualBench(body, layout=layout, size=0.3), PLANE.names)
 
 
-def _compute_deformations(bench: VirtualBench, names: Iterable[str]) -> dict[str, Deformation]:
+def _compute_deformations(
+    bench: VirtualBench,
+    names: Iterable[str],
+) -> dict[str, Deformation]:
     axes = (0, 2)
     deformations = {}
     for name in names:

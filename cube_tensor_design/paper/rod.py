@@ -175,7 +175,11 @@ class RodContact:
         moved = np.asarray(self._facets.interpolate(u))
         position = x[0] + self._finite * moved[0]
         top = x[1].max()
-        height, slope, curvature = self._rod.lower_side(position, top, self._unit)
+        height, slope, curvature = self._rod.lower_side(
+            position,
+            top,
+            self._unit,
+        )
         g = x[1] + moved[1] - height
         # A smooth form of max(g, 0), which differs within the onset length only.
         root = np.hypot(g, ONSET_LENGTH)

@@ -121,7 +121,11 @@ def split_rod_signals(
         by_pads = np.stack(rows, axis=1)  # (pads, places, parts)
         for pads, parts in zip(PADS, by_pads, strict=True):
             signal = parts.sum(axis=1)
-            found[f"{rod}, {pads}"] = RodParts(np.array(places), signal, parts)
+            found[f"{rod}, {pads}"] = RodParts(
+                np.array(places),
+                signal,
+                parts,
+            )
     return found
 
 
@@ -201,7 +205,11 @@ def _split_field(bench: VirtualBench, field: Array) -> Array:
     polynomials, part = _make_polynomials(bench)
     # Columns of equal norm keep the fit well conditioned.
     polynomials /= np.linalg.norm(polynomials[:, dofs], axis=1, keepdims=True)
-    amplitude, *_ = np.linalg.lstsq(polynomials[:, dofs].T, field[dofs], rcond=None)
+    amplitude, *_ = np.linalg.lstsq(
+        polynomials[:, dofs].T,
+        field[dofs],
+        rcond=None,
+    )
     parts = np.zeros((len(PARTS), len(field)))
     for number in range(len(PARTS) - 1):
         chosen = part == number

@@ -94,7 +94,12 @@ def recover_rod_shear(
     tensor_kernel = compute_line_load(layer, x, depth, body.side / 2)
     pad_kernel = influence.at(x[:, None])
     shear_kernel = tensor_kernel[zx]
-    from_tensor = _compute_shear_weights(tensor_kernel, shear_kernel, x, depth)
+    from_tensor = _compute_shear_weights(
+        tensor_kernel,
+        shear_kernel,
+        x,
+        depth,
+    )
     from_pads = _compute_shear_weights(pad_kernel, shear_kernel, x, depth)
 
     eq_4_gain = SHEAR_SIGNS @ response[:4, zx]

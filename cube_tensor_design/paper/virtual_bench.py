@@ -264,7 +264,13 @@ class VirtualBench:
 
     def make_rod_contact(self, rod: Rod) -> RodContact:
         """Return the contact of a rod with the top."""
-        return RodContact(self._top, rod, self._half_side, self.body.young, self.finite)
+        return RodContact(
+            self._top,
+            rod,
+            self._half_side,
+            self.body.young,
+            self.finite,
+        )
 
     def solve_field(self, stress: Array, gradient: Array) -> Deformation:
         """Solve for the outer tractions of the field sigma_ij = S_ij + G_ijk x_k / d0, linearly.
@@ -306,7 +312,12 @@ class VirtualBench:
             return np.abs(x[1] - z) < SURFACE_TOLERANCE
 
         facets = mesh.facets_satisfying(is_at_height, boundaries_only=True)
-        return skfem.FacetBasis(mesh, self.section.basis.elem, facets=facets, intorder=8)
+        return skfem.FacetBasis(
+            mesh,
+            self.section.basis.elem,
+            facets=facets,
+            intorder=8,
+        )
 
     def _make_task(self, step: LoadStep, loose: Array) -> _Task:
         """Return the constraints and the rod of a step; `loose` (dofs,) are the displacements after
@@ -370,7 +381,14 @@ class VirtualBench:
         linear = not self.finite and contact is None
         balance = partial(self._balance, contact=contact)
         with np.errstate(all="ignore"):  # A failed attempt has inverted elements.
-            return find_balance(u, task.prescribed, task.rows, balance, tangent, linear)
+            return find_balance(
+                u,
+                task.prescribed,
+                task.rows,
+                balance,
+                tangent,
+                linear,
+            )
 
     def _balance(self, u: Array, contact: RodContact | None) -> Balance | None:
         """Return nodal forces out of balance, and energy; None when an element is inside out."""

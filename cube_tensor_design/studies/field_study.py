@@ -192,7 +192,12 @@ def compute_field_example() -> FieldExample:
     values = compute_true_components(skin.position, width, force, centre)
     pressure = {}
     for kind in SKIN_KINDS[:2]:
-        surface = Surface(skin, SURFACE_DEPTH, 20, gradients=kind != "values alone")
+        surface = Surface(
+            skin,
+            SURFACE_DEPTH,
+            20,
+            gradients=kind != "values alone",
+        )
         true = compute_true_components(surface.points, width, force, centre)
         pressure["truth"] = -true[:, COMPONENTS.index("zz")]
         pressure[kind] = surface.field(values).pressure
@@ -227,20 +232,34 @@ class _Trial:
         self._surfaces = {}
         for kind in SKIN_KINDS:
             has_gradients = kind != "values alone"
-            self._surfaces[kind] = Surface(self._skin, SURFACE_DEPTH, side, gradients=has_gradients)
+            self._surfaces[kind] = Surface(
+                self._skin,
+                SURFACE_DEPTH,
+                side,
+                gradients=has_gradients,
+            )
         points = self._surfaces["values alone"].points
         from_centre = np.abs(points[:, :2]).max(axis=1)
         self._window = from_centre < WINDOW / 2
         self._points = points[self._window]
 
-    def compute_square_errors(self, width: float, random: np.random.Generator) -> list[float]:
+    def compute_square_errors(
+        self,
+        width: float,
+        random: np.random.Generator,
+    ) -> list[float]:
         """Return, by kind of skin, the mean square error of the pressure over its mean square
         under a random contact of this width."""
         centre = self._pitch * (random.random(2) - 0.5)
         force = draw_force(random)
         true = compute_true_components(self._points, width, force, centre)
         pressure = -true[:, COMPONENTS.index("zz")]
-        measured = compute_true_components(self._skin.position, width, force, centre)
+        measured = compute_true_components(
+            self._skin.position,
+            width,
+            force,
+            centre,
+        )
         square_errors = []
         for kind, surface in self._surfaces.items():
             values = measured.copy()

@@ -114,7 +114,12 @@ class _Passage:
         """Return stress (n, 6) and gradient (n, 6, 3) at x (n, 3), in m from the cube's centre."""
         order = 4 + int(np.ceil(self.width / MAX_POINT_SPACING))
         force = [FRICTION, 0.0, -1.0]
-        sources, forces = contact.disc(self.width / 2, force, (self.offset, 0.0), order)
+        sources, forces = contact.disc(
+            self.width / 2,
+            force,
+            (self.offset, 0.0),
+            order,
+        )
         points = x + np.array([0.0, LATERAL_OFFSET, -DEPTH])
         return contact.field(points, sources, forces, POISSONS_RATIO)
 

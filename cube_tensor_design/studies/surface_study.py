@@ -125,7 +125,11 @@ def study_surface(
     report("response matrix")
     inverse = _compute_inverse_rows(body, layout, meshes, neglect)
     report("influence functions")
-    influence = compute_influence(replace(body, ground=True), layout, meshes - 1)
+    influence = compute_influence(
+        replace(body, ground=True),
+        layout,
+        meshes - 1,
+    )
 
     rows = []
     for load, width, offset in itertools.product(LOADS, widths, offsets):
@@ -153,7 +157,12 @@ def _compute_inverse_rows(
 ) -> dict[str, Array]:
     """Return, for each component that the pads tell from all other modes, the row (P,) of the
     pseudo-inverse of the response matrix: from pad stresses to the component."""
-    response = compute_response(body, layout, find_largest_symmetry(layout), meshes)
+    response = compute_response(
+        body,
+        layout,
+        find_largest_symmetry(layout),
+        meshes,
+    )
     modes = choose_default_modes(layout)
     estimator = estimate_modes(response.matrix, modes, neglect)
     rows = {

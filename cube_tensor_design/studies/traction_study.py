@@ -180,7 +180,12 @@ class TractionBench:
         reading = None if influence is None else model_pads(influence, calibrations)
         known_layer = Layer(setting.known_thickness)
         self.inverse = SurfaceInverse.from_poses(
-            self.poses, by_pad, known_layer, setting.depth, side, reading
+            self.poses,
+            by_pad,
+            known_layer,
+            setting.depth,
+            side,
+            reading,
         )
         self.surface = Surface(self.poses, setting.depth, side or 2)
         points = np.abs(self.inverse.points[:, :2])
@@ -220,7 +225,12 @@ class TractionBench:
         """Return the true pressure (M,) on the surface, in Pa, as the mean over the square of each
         point of the inverse."""
         inverse = self.inverse
-        sources, forces = self.point_forces(width, force, centre, SURFACE_ORDER)
+        sources, forces = self.point_forces(
+            width,
+            force,
+            centre,
+            SURFACE_ORDER,
+        )
         # Each point force counts for the square in which it lies.
         tree = cKDTree(inverse.points[:, :2])
         nearest = tree.query(sources[:, :2])[1]
@@ -288,7 +298,12 @@ class TractionBench:
         gain = 1 + self.setting.gain_error * random.standard_normal(pads.shape)
         pads = pads * gain
         rest = calibration.rest_frequency
-        frequency = pad_frequency(pads, rest, calibration.beta, calibration.modulus)
+        frequency = pad_frequency(
+            pads,
+            rest,
+            calibration.beta,
+            calibration.modulus,
+        )
         frequency *= 1 + FREQUENCY_NOISE * random.standard_normal(frequency.shape)
         rows = FrequencyRows.of(np.arange(len(frequency)), frequency)
         result = self._pipeline.process(rows, left_out)
@@ -310,7 +325,11 @@ class TractionBench:
         random = np.random.default_rng(seed)
         results = [self._compute_case_errors(width, random) for _ in range(cases)]
         field, found, below, surface, is_single = zip(*results, strict=True)
-        force, force_deviation, position, position_deviation = np.moveaxis(np.array(found), 2, 0)
+        force, force_deviation, position, position_deviation = np.moveaxis(
+            np.array(found),
+            2,
+            0,
+        )
         ratio = [force / force_deviation, position / position_deviation]
         field_ratio = [np.concatenate(squares).mean() for squares in (below, surface)]
         return Errors(
@@ -387,7 +406,12 @@ class TractionBench:
             centre: (2,) position of the contact, in m.
         """
         force = FORCE * np.array([FRICTION, 0.0, -1.0])
-        values = self.compute_values(width, force, centre, np.random.default_rng(1))
+        values = self.compute_values(
+            width,
+            force,
+            centre,
+            np.random.default_rng(1),
+        )
         points = self.inverse.points
         tracker, _, pressures = self._solve(values)
         pressure = {
@@ -424,7 +448,8 @@ class ContactErrors(NamedTuple):
 
 
 def sum_contact_errors(
-    contacts: Sequence[Contact | TrackedContact], centre: Array
+    contacts: Sequence[Contact | TrackedContact],
+    centre: Array,
 ) -> ContactErrors:
     """Return the errors of contacts that are summed as if they were independent of each other.
 

@@ -240,7 +240,12 @@ class McapReader:
             begin += RECORD_HEAD.size + read_head(data, begin)[1]
         # The elements of this array are views of the data: element i is the head of the message
         # record that would begin at byte i. Those at `begins` are the real heads.
-        heads: AnyArray = np.ndarray(n_heads, f"V{_MESSAGE_HEAD.itemsize}", data, strides=(1,))
+        heads: AnyArray = np.ndarray(
+            n_heads,
+            f"V{_MESSAGE_HEAD.itemsize}",
+            data,
+            strides=(1,),
+        )
         record_begin = np.array(begins, np.intp)
         head = heads[record_begin].view(_MESSAGE_HEAD)
         message_begin = record_begin + _MESSAGE_HEAD.itemsize
@@ -320,7 +325,11 @@ class McapWriter:
         name = topic.msgtype
         if name not in self._schemas:
             text = topic.definition.encode()
-            self._schemas[name] = self._writer.register_schema(name, "ros2msg", text)
+            self._schemas[name] = self._writer.register_schema(
+                name,
+                "ros2msg",
+                text,
+            )
         profiles = to_yaml(list(topic.qos)) if topic.qos else ""
         return self._writer.register_channel(
             topic.topic,
@@ -390,7 +399,10 @@ def report_parse_errors() -> Iterator[None]:
         raise McapError(str(error) or type(error).__name__) from None
 
 
-def parse_record(read: Callable[[ReadDataStream], _Record], content: bytes) -> _Record:
+def parse_record(
+    read: Callable[[ReadDataStream], _Record],
+    content: bytes,
+) -> _Record:
     """Parse an MCAP record.
 
     Args:

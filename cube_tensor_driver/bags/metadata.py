@@ -155,7 +155,11 @@ def parse_profiles(text: str, topic: str) -> Sequence[QosProfile]:
             return profiles
     except ConfigError as error:
         reason = str(error)
-    _log.warning("%s: its quality of service profiles are damaged (%s)", topic, reason)
+    _log.warning(
+        "%s: its quality of service profiles are damaged (%s)",
+        topic,
+        reason,
+    )
     return ()
 
 

@@ -437,7 +437,11 @@ class Bag:
         if len(others) == len(read):
             self._refuse_version(f"{topic} has version {read[0][1].version}")
         for time_ns, version in others.items():
-            self.skip(topic, time_ns, MessageError(f"version {version}, not {VERSION}"))
+            self.skip(
+                topic,
+                time_ns,
+                MessageError(f"version {version}, not {VERSION}"),
+            )
         return [info for _, info in read if info.version == VERSION]
 
     def frequencies(self, topic: str) -> Iterator[tuple[Decoded[FrequencyRows], Times]]:
@@ -452,7 +456,11 @@ class Bag:
         Raises:
             BagError: A file of the bag is damaged.
         """
-        return self._decode_batches(topic, frequency_codec, frequency_codec.decode)
+        return self._decode_batches(
+            topic,
+            frequency_codec,
+            frequency_codec.decode,
+        )
 
     def stress(self, topic: str) -> Iterator[tuple[Decoded[StressRows], Times]]:
         """Read the recorded stress on a topic in the order of recording.

@@ -219,7 +219,10 @@ def read_settings(info: SkinInfo) -> Settings:
     return Settings(calibrations, pad_table(rest, widest, np.nan))
 
 
-def make_recorded_skin(info: SkinInfo, calibrations: tuple[Calibration, ...]) -> Skin:
+def make_recorded_skin(
+    info: SkinInfo,
+    calibrations: tuple[Calibration, ...],
+) -> Skin:
     """Return the skin that a SkinInfo message describes.
 
     Args:

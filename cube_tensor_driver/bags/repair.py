@@ -414,7 +414,11 @@ def _encode_summary(salvaged: _Salvaged, name: str) -> bytes:
     about = make_rosbag2_metadata(summarise(name, index))
     metadata = Metadata(ROSBAG2_RECORD, about)
     metadata_length = len(_encode_record([metadata]))
-    metadata_index = MetadataIndex(salvaged.end, metadata_length, ROSBAG2_RECORD)
+    metadata_index = MetadataIndex(
+        salvaged.end,
+        metadata_length,
+        ROSBAG2_RECORD,
+    )
     data_end = _encode_record([metadata, DataEnd(0)])
 
     summary_start = salvaged.end + len(data_end)

@@ -111,7 +111,11 @@ class SqliteReader:
         )
         damaged = total - self.summary.msgcount
         if damaged:
-            _log.warning("%s: %d damaged messages are left out", path, damaged)
+            _log.warning(
+                "%s: %d damaged messages are left out",
+                path,
+                damaged,
+            )
 
     def close(self) -> None:
         """Close the file."""

@@ -98,7 +98,10 @@ def make_cube_column(
     return pyarrow.DictionaryArray.from_arrays(index.astype(np.int32), cubes)
 
 
-def make_stress_batch(rows: StressRows, cubes: pyarrow.Array) -> pyarrow.RecordBatch:
+def make_stress_batch(
+    rows: StressRows,
+    cubes: pyarrow.Array,
+) -> pyarrow.RecordBatch:
     """Return rows of stress (samples of cubes) as Arrow columns with `STRESS_SCHEMA`.
 
     Args:
@@ -192,7 +195,11 @@ class TableWriter(BufferedTable):
         with report_write_errors(path):
             if path.suffix == ".csv":
                 # CSV has no dictionary encoding, so every row contains the name of its cube.
-                plain = pyarrow.field("cube", pyarrow.string(), nullable=False)
+                plain = pyarrow.field(
+                    "cube",
+                    pyarrow.string(),
+                    nullable=False,
+                )
                 self._schema = STRESS_SCHEMA.set(1, plain)
                 self._writer = pyarrow.csv.CSVWriter(str(path), self._schema)
             else:

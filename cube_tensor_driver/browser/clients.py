@@ -70,7 +70,11 @@ class ServiceCalls:
             notes_success: Whether a note is shown if the service did what was requested.
         """
         if not client.service_is_ready():
-            self._say(f"{what} not possible", "no node that can do it is running", "red")
+            self._say(
+                f"{what} not possible",
+                "no node that can do it is running",
+                "red",
+            )
             return
         future = client.call_async(request)
         self._open.append(_Call(what, future, time.monotonic(), notes_success))
@@ -94,7 +98,11 @@ class ServiceCalls:
                 elif call.notes_success:
                     self._say(f"{call.what} done", answer.message, "green")
             elif time.monotonic() - call.asked_s > MAX_ANSWER_S:
-                self._say(f"{call.what} failed", f"no answer within {MAX_ANSWER_S:g} s", "red")
+                self._say(
+                    f"{call.what} failed",
+                    f"no answer within {MAX_ANSWER_S:g} s",
+                    "red",
+                )
                 call.future.cancel()
             else:
                 still_open.append(call)

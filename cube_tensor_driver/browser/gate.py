@@ -208,7 +208,11 @@ class Gate:
         request, _, fields = head.partition(b"\r\n")
         headers = http.client.parse_headers(io.BytesIO(fields))
         host = headers.get("Host", "")
-        problem = find_refusal(host, headers.get("Origin"), local=not self._token)
+        problem = find_refusal(
+            host,
+            headers.get("Origin"),
+            local=not self._token,
+        )
         # A browser sends a cookie to every port of a host. Two servers on one host therefore need
         # cookies with different names, and the name contains the port.
         cookie = f"cube_view_{_split(host)[1]}={self._token}"
@@ -222,7 +226,10 @@ class Gate:
         return "", f"Set-Cookie: {cookie}; HttpOnly; SameSite=Lax\r\n".encode()
 
 
-async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+async def _copy(
+    reader: asyncio.StreamReader,
+    writer: asyncio.StreamWriter,
+) -> None:
     """Pass bytes on until the connection ends at one side, then end it at the other side."""
     with suppress(OSError):
         while data := await reader.read(_CHUNK_BYTES):

@@ -417,7 +417,11 @@ class Scene:
         """
         placement, pitch = self._placement, self._placement.pitch
         poses = placement.poses
-        lines, is_tension = scene.make_principal_crosses(poses, values, pitch / longest)
+        lines, is_tension = scene.make_principal_crosses(
+            poses,
+            values,
+            pitch / longest,
+        )
         # The lines are centred on the upper faces of the cubes, which would hide a part of them, so
         # they are lifted to `CROSS_HEIGHT`.
         height = CROSS_HEIGHT * pitch - poses.half_side

@@ -86,7 +86,11 @@ class FieldModel:
         self._nearest: Index = np.empty((0, 1), np.intp)
         self._weight: Array = np.empty((0, 1))
         worker = ThreadPoolExecutor(1)
-        self.prepared: Future[SurfaceInverse] = worker.submit(_make_inverse, surface, calibrations)
+        self.prepared: Future[SurfaceInverse] = worker.submit(
+            _make_inverse,
+            surface,
+            calibrations,
+        )
         # The thread ends when the preparation is done.
         worker.shutdown(wait=False)
 
@@ -119,11 +123,19 @@ class FieldModel:
             shear_size = np.hypot(x, y)
             columns = np.stack([-z, shear_size], axis=1)
             pressure, shear = self._interpolate(inverse.points, columns).T
-            return SurfaceField(pressure, shear, "on the surface of a thick elastomer")
+            return SurfaceField(
+                pressure,
+                shear,
+                "on the surface of a thick elastomer",
+            )
         between = self._surface.field(values)
         # A shear component that is unknown (NaN) counts as 0 in the magnitude.
         shear = np.linalg.norm(np.nan_to_num(between.shear), axis=1)
-        return SurfaceField(between.pressure, shear, "between the cubes, at their depth")
+        return SurfaceField(
+            between.pressure,
+            shear,
+            "between the cubes, at their depth",
+        )
 
     def _interpolate(self, points: Array, columns: Array) -> Array:
         """Interpolate C quantities to the N points of the surface, (N, C).

@@ -260,7 +260,11 @@ class Viewer:
         size = client.camera.image_width, client.camera.image_height
         layout = self._layouts.setdefault(client.client_id, PageLayout(*size))
         if self._shown is None:
-            show_waiting(client, layout, markup.describe_waiting(describe_domain()))
+            show_waiting(
+                client,
+                layout,
+                markup.describe_waiting(describe_domain()),
+            )
             return
 
         def act(action: str, *arguments: object) -> None:
@@ -290,7 +294,11 @@ class Viewer:
         health = scans.latest.health(self._subscriber.now(), stale_s)
         if has_advanced:
             values = scans.latest.usable_values(health)
-            self._history.add(1e-9 * scans.stamp_ns, values, scans.latest.residual)
+            self._history.add(
+                1e-9 * scans.stamp_ns,
+                values,
+                scans.latest.residual,
+            )
         # Without a page, computing the field and the contacts would be useless work.
         if not self._pages:
             return

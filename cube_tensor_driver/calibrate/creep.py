@@ -155,7 +155,10 @@ class _Hold(NamedTuple):
     memory: Array
 
 
-def fit_recorded_creep(path: Path, name: str | None) -> tuple[CreepFit, Calibration]:
+def fit_recorded_creep(
+    path: Path,
+    name: str | None,
+) -> tuple[CreepFit, Calibration]:
     """Fit the law of creep of a cube to a bag with one press that is held.
 
     Args:
@@ -175,7 +178,11 @@ def fit_recorded_creep(path: Path, name: str | None) -> tuple[CreepFit, Calibrat
         settings = source.recording.settings[0]
         calibration = settings.calibrations[number]
         n_pads = calibration.layout.n_pads
-        stamp_ns, frequency, temperature = read_samples(source, number, n_pads)
+        stamp_ns, frequency, temperature = read_samples(
+            source,
+            number,
+            n_pads,
+        )
     rest = settings.rest_frequency[number, :n_pads]
     current = replace(calibration, rest_frequency=rest)
 
@@ -240,7 +247,14 @@ def fit_creep(
     known = first[:, is_known]
     shorter, longer = known[:, :-1], known[:, 1:]
     growth = float((longer * shorter).sum() / (shorter**2).sum())
-    amplitude, error, change = _solve(means, load, noise, forecast, growth, BEND)
+    amplitude, error, change = _solve(
+        means,
+        load,
+        noise,
+        forecast,
+        growth,
+        BEND,
+    )
     misfit = float(np.sqrt(np.mean((error / load) ** 2)))
     total = amplitude.sum(axis=1).max()
     if misfit > MAX_MISFIT or total >= 1:

@@ -89,7 +89,11 @@ def read_recorded_loads(
         calibration = settings.calibrations[number]
         calibration.check(layout)
         rest = settings.rest_frequency[number, : layout.n_pads]
-        stamp_ns, frequency, temperature = read_samples(source, number, layout.n_pads)
+        stamp_ns, frequency, temperature = read_samples(
+            source,
+            number,
+            layout.n_pads,
+        )
         reference_ns, state = _read_reference(
             source.bag,
             reference,

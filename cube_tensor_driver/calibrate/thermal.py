@@ -220,7 +220,12 @@ def read_warming(
     for cube in first.cubes:
         base = bags[-1].calibrations[cube]
         rest = bags[-1].rest_frequency[cube, : base.layout.n_pads]
-        base = replace(base, temperature=None, thermal=None, rest_frequency=rest)
+        base = replace(
+            base,
+            temperature=None,
+            thermal=None,
+            rest_frequency=rest,
+        )
         parts = [bag.of_cube(cube) for bag in bags]
         seconds, stress, temperature = (np.concatenate(each) for each in zip(*parts, strict=True))
         ends = np.cumsum([len(part[0]) for part in parts])
@@ -371,7 +376,15 @@ def _solve(
     residual = data.stress - columns @ values
     size = root_mean_square(residual * weight[:, None])
     misfit = np.log(size) - np.log(weight).mean()
-    return _Solution(lags, behind, columns, weight, values, residual, float(misfit))
+    return _Solution(
+        lags,
+        behind,
+        columns,
+        weight,
+        values,
+        residual,
+        float(misfit),
+    )
 
 
 def _describe(data: Warming, best: _Solution) -> ThermalFit:

@@ -20,10 +20,12 @@ if TYPE_CHECKING:
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
     info = parser.add_subcommand(
-        "info", "print skin, cubes, calibrations, rates, gaps and counters"
+        "info",
+        "print skin, cubes, calibrations, rates, gaps and counters",
     )
     repair = parser.add_subcommand(
-        "repair", "make a bag readable that was cut off: killed, disk full, power lost"
+        "repair",
+        "make a bag readable that was cut off: killed, disk full, power lost",
     )
     for command in (info, repair):
         command.add_bag()

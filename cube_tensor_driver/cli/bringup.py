@@ -59,7 +59,11 @@ def add_arguments(parser: Parser) -> None:
         required=True,
         help="skin file to write",
     )
-    parser.add_argument("--name", default="skin", help="name of the skin (default: %(default)s)")
+    parser.add_argument(
+        "--name",
+        default="skin",
+        help="name of the skin (default: %(default)s)",
+    )
     parser.add_text(
         "--calibration",
         "FILE",

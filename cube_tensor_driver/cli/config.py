@@ -45,7 +45,11 @@ def add_arguments(parser: Parser) -> None:
         default=1,
     )
     grid.add_rate()
-    grid.add_argument("--name", default="skin", help="name of the skin (default: %(default)s)")
+    grid.add_argument(
+        "--name",
+        default="skin",
+        help="name of the skin (default: %(default)s)",
+    )
     grid.add_argument(
         "--port",
         default="/dev/ttyACM{}",
@@ -103,7 +107,11 @@ def write_grid(options: argparse.Namespace) -> int:
     # This text is printed and also becomes the header of the file.
     text = f"{size}, on {format_count(options.links, 'link')}"
     with show_working(f"writing {len(skin['cubes'])} cubes"):
-        write_yaml(options.output, skin, f"{text}. docs/config.md describes the keys.")
+        write_yaml(
+            options.output,
+            skin,
+            f"{text}. docs/config.md describes the keys.",
+        )
     print(f"wrote {options.output}: {text}")
     return 0
 

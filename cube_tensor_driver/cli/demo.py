@@ -14,14 +14,22 @@ DEFAULT_DURATION_S = 10.0
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_path("--config", "FILE", "skin file to simulate (default: sixteen planar cubes)")
+    parser.add_path(
+        "--config",
+        "FILE",
+        "skin file to simulate (default: sixteen planar cubes)",
+    )
     parser.add_number(
         "--cubes",
         count,
         "N",
         "simulate a grid of N planar cubes instead",
     )
-    parser.add_path("--load", "FILE", "load script (default: a contact that wanders over the skin)")
+    parser.add_path(
+        "--load",
+        "FILE",
+        "load script (default: a contact that wanders over the skin)",
+    )
     parser.add_path(
         "--mujoco",
         "SCENE",

@@ -59,10 +59,16 @@ def add_arguments(parser: Parser) -> None:
         nargs="*",
     )
     lerobot.add_text(
-        "--state", "TOPIC", "topic of observation.state (default: the only topic of joint states)"
+        "--state",
+        "TOPIC",
+        "topic of observation.state (default: the only topic of joint states)",
     )
     lerobot.add_text("--action", "TOPIC", "topic of action (default: none)")
-    lerobot.add_text("--frequencies", "TOPIC", "frequencies to export, of several skins in a bag")
+    lerobot.add_text(
+        "--frequencies",
+        "TOPIC",
+        "frequencies to export, of several skins in a bag",
+    )
     for name, text in TABLES.items():
         table = parser.add_subcommand(name, text)
         _add_common(table)

@@ -35,9 +35,15 @@ def add_arguments(parser: Parser) -> None:
         nargs="?",
     )
     parser.add_text(
-        "--reference", "TOPIC", "topic of the bag to fit to: WrenchStamped (with --area) or stress"
+        "--reference",
+        "TOPIC",
+        "topic of the bag to fit to: WrenchStamped (with --area) or stress",
     )
-    parser.add_text("--cube", "NAME", "cube of the bag, if there are several in it")
+    parser.add_text(
+        "--cube",
+        "NAME",
+        "cube of the bag, if there are several in it",
+    )
     parser.add_text("--layout", "NAME", "quad, planar, cube, or a YAML file")
     parser.add_path(
         "--weight",
@@ -169,7 +175,11 @@ def run_table(options: argparse.Namespace) -> None:
     # The calibration file contains time and source, so that its origin can be found later.
     created = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
     table = options.loads.name
-    calibration = result.make_calibration(base, created, f"fit of {table}, {len(measured)} loads")
+    calibration = result.make_calibration(
+        base,
+        created,
+        f"fit of {table}, {len(measured)} loads",
+    )
     words = f"{table} --layout {options.layout} --symmetry {options.symmetry}"
     save(draw_fit(result, measured), options.figure)
     write_result(options.output, calibration, words)
@@ -218,10 +228,18 @@ def run_weight(options: argparse.Namespace) -> None:
         ]
         pads = calibration.layout.pads
         rows = [(pad, *values) for pad, values in zip(pads, cells, strict=True)]
-        print_table(("pad",), [f"{axis}, Pa per m/s²" for axis in "xyz"], rows)
+        print_table(
+            ("pad",),
+            [f"{axis}, Pa per m/s²" for axis in "xyz"],
+            rows,
+        )
     title = f"stress of the {len(calibration.gain)} pads under weight alone"
     save(draw_correction(title, *shown), options.figure)
-    write_result(options.output, calibration, f"--weight {options.weight.name}")
+    write_result(
+        options.output,
+        calibration,
+        f"--weight {options.weight.name}",
+    )
 
 
 def run_creep(options: argparse.Namespace) -> None:
@@ -336,7 +354,11 @@ def show_fit(result: Fit, remark: str) -> None:
         if math.isfinite(value):
             cells = (f"{value:+.5f}", f"{result.deviations[name]:.2g}")
         coefficients.append((name, *cells))
-    print_table(("coefficient",), ("value", "standard deviation"), coefficients)
+    print_table(
+        ("coefficient",),
+        ("value", "standard deviation"),
+        coefficients,
+    )
 
     say("gains (average 1 over pads that the symmetry carries onto each other)")
     pads = result.structure.layout.pads

@@ -19,7 +19,9 @@ def add_arguments(parser: Parser) -> None:
         nargs="+",
     )
     parser.add_path(
-        "--ports", "DIR", "folder of the simulated ports (default: that of the newest demo)"
+        "--ports",
+        "DIR",
+        "folder of the simulated ports (default: that of the newest demo)",
     )
 
 

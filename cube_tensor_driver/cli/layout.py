@@ -16,11 +16,21 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_text("name", "NAME", "quad, planar, cube, or a YAML file with a layout")
     parser.add_text(
-        "--symmetry", "G", "full, slab, mirrors or none (default: that of the calibration)"
+        "name",
+        "NAME",
+        "quad, planar, cube, or a YAML file with a layout",
     )
-    parser.add_text("--calibration", "FILE", "calibration file or name (default: the computed one)")
+    parser.add_text(
+        "--symmetry",
+        "G",
+        "full, slab, mirrors or none (default: that of the calibration)",
+    )
+    parser.add_text(
+        "--calibration",
+        "FILE",
+        "calibration file or name (default: the computed one)",
+    )
     parser.add_json()
     parser.add_output(
         "--figure",
@@ -70,7 +80,11 @@ def run(options: argparse.Namespace) -> int:
         }
         source = "no calibration: conditions and noise unknown"
     else:
-        result = summarize_response(structure, calibration.response, calibration.neglect)
+        result = summarize_response(
+            structure,
+            calibration.response,
+            calibration.neglect,
+        )
         source = f"calibration {calibration.id} ({calibration.source or 'no source given'})"
     show_layout(layout, symmetry, result, source)
     if options.json is not None:

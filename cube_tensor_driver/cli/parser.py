@@ -192,7 +192,9 @@ class Parser(argparse.ArgumentParser):
                 required=True,
             )
         added: Parser = self._subcommands.add_parser(
-            name, help=text, description=make_sentence(text)
+            name,
+            help=text,
+            description=make_sentence(text),
         )
         return added
 
@@ -391,8 +393,16 @@ sample_rate = _number_type(
     lambda rate: 0.1 <= rate <= 10_000,
 )
 count = _number_type(int, "a whole number of at least 1", lambda n: n >= 1)
-whole_number = _number_type(int, "a whole number of at least 0", lambda n: n >= 0)
-tcp_port = _number_type(int, "a TCP port, 1 to 65535", lambda n: 1 <= n <= 65535)
+whole_number = _number_type(
+    int,
+    "a whole number of at least 0",
+    lambda n: n >= 0,
+)
+tcp_port = _number_type(
+    int,
+    "a TCP port, 1 to 65535",
+    lambda n: 1 <= n <= 65535,
+)
 uid = _number_type(
     # With base 0, `int` accepts decimal numbers, and hexadecimal numbers that begin with 0x.
     lambda text: int(text, 0),

@@ -116,7 +116,8 @@ class RecordingStatus:
         if recorder.dropped > self._dropped:
             self._dropped = recorder.dropped
             self._console.print(
-                f"the disk is too slow: {self._dropped} messages dropped so far", style="red"
+                f"the disk is too slow: {self._dropped} messages dropped so far",
+                style="red",
             )
 
     def print_summary(self, recorder: Recorder) -> None:
@@ -131,7 +132,8 @@ class RecordingStatus:
             self._console.print(f"  {count:8} {topic}")
         for topic, seconds in recorder.late.items():
             self._console.print(
-                f"{topic} came {seconds:.1f} s later than the other topics", style="yellow"
+                f"{topic} came {seconds:.1f} s later than the other topics",
+                style="yellow",
             )
         for topic in recorder.missing:
             self._console.print(f"         0 {topic}: nobody offers it", style="yellow")

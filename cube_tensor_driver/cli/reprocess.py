@@ -56,9 +56,15 @@ def add_overrides(parser: Parser) -> None:
     Args:
         parser: The parser of a command that reprocesses bags.
     """
-    parser.add_text("--calibration", "FILE", "calibration of all cubes (default: as recorded)")
+    parser.add_text(
+        "--calibration",
+        "FILE",
+        "calibration of all cubes (default: as recorded)",
+    )
     parser.add_path(
-        "--skin", "FILE", "skin file with the calibrations to use, for cubes of the same names"
+        "--skin",
+        "FILE",
+        "skin file with the calibrations to use, for cubes of the same names",
     )
     parser.add_argument(
         "--tare-from",
@@ -114,7 +120,11 @@ def run(options: argparse.Namespace) -> int:
                 report(done, len(waiting), "reprocessing")
                 if isinstance(result, CubeError):
                     failed += 1
-                    console.print(f"cube: {result}", style="red", markup=False)
+                    console.print(
+                        f"cube: {result}",
+                        style="red",
+                        markup=False,
+                    )
                 else:
                     console.print(format_result(job.output, result))
     finally:

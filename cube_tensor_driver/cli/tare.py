@@ -19,7 +19,8 @@ def add_arguments(parser: Parser) -> None:
         nargs="*",
     )
     parser.add_switch(
-        "--clear", "go back to the rest frequencies of the calibration, for all cubes"
+        "--clear",
+        "go back to the rest frequencies of the calibration, for all cubes",
     )
 
 

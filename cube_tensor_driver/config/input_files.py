@@ -109,7 +109,8 @@ def read_arrays(path: Path, limit: int) -> dict[str, AnyArray]:
             # checksum only at its end. `np.load` would parse damaged bytes.
             return {
                 name.removesuffix(".npy"): np.lib.format.read_array(
-                    io.BytesIO(archive.read(name)), allow_pickle=False
+                    io.BytesIO(archive.read(name)),
+                    allow_pickle=False,
                 )
                 for name in archive.namelist()
             }

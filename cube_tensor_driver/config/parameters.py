@@ -118,7 +118,11 @@ FRAME_PREFIX = Parameter(
 )
 """Declaration of the ROS parameter `frame_prefix` of all nodes that read a skin file."""
 
-CONFIG = Parameter("config", "", "Path of the skin file (YAML). It is required.")
+CONFIG = Parameter(
+    "config",
+    "",
+    "Path of the skin file (YAML). It is required.",
+)
 """Declaration of the ROS parameter `config` of the nodes `driver` and `simulated_imu`."""
 
 DRIVER = (
@@ -339,7 +343,9 @@ SIMULATED_IMU = (
     FRAME_PREFIX,
     Parameter("port_directory", "", "Folder in which the simulated hubs make their ports."),
     Parameter(
-        "imperfections", "", "Path of the file (YAML) from which the simulated hubs take `poses`."
+        "imperfections",
+        "",
+        "Path of the file (YAML) from which the simulated hubs take `poses`.",
     ),
 )
 """Declarations of the ROS parameters of the node `simulated_imu`, which goes with simulated hubs of

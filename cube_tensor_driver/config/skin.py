@@ -249,7 +249,11 @@ def read_skin(path: str | Path, frame_prefix: str = "") -> Skin:
         parent_frame = frame_prefix + skin.parent_frame
         for _, mistake in Schema(_FRAME).find_mistakes(parent_frame):
             raise ConfigError(f"frame_prefix {frame_prefix!r}: {mistake.partition(': ')[2]}")
-        return replace(skin, parent_frame=parent_frame, frame_prefix=frame_prefix)
+        return replace(
+            skin,
+            parent_frame=parent_frame,
+            frame_prefix=frame_prefix,
+        )
     others = len(mistakes) - 1
     more = f" (and {others} more: ./cube config check {path})" if others else ""
     raise ConfigError(f"{path}: {mistakes[0]}{more}")
@@ -303,7 +307,11 @@ def check_skin_data(
                 f"elastomer.depth: {elastomer.depth} m; it must be below the thickness, "
                 f"{elastomer.thickness} m"
             )
-    cubes, cube_mistakes = _read_cubes(data["cubes"], folder, [link.name for link in links])
+    cubes, cube_mistakes = _read_cubes(
+        data["cubes"],
+        folder,
+        [link.name for link in links],
+    )
     mistakes += [
         *_find_link_mistakes(links),
         *cube_mistakes,

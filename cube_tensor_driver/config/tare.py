@@ -82,7 +82,11 @@ def write_tare(
     write_yaml(tare_path(folder, uid), content, _HEADER)
 
 
-def read_tare(folder: Path, uid: int, calibration: Calibration) -> StoredTare | None:
+def read_tare(
+    folder: Path,
+    uid: int,
+    calibration: Calibration,
+) -> StoredTare | None:
     """Return the stored tare (frequencies without load) of a cube; None if there is no file for it.
 
     Args:

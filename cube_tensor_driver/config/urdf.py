@@ -56,7 +56,11 @@ def make_skin_urdf(skin: Skin) -> str:
         )
         for cube in skin.cubes
     ]
-    return _ROBOT.format(name=skin.name, parent=skin.parent_frame, cubes="".join(cubes))
+    return _ROBOT.format(
+        name=skin.name,
+        parent=skin.parent_frame,
+        cubes="".join(cubes),
+    )
 
 
 def _format(values: tuple[float, float, float]) -> str:

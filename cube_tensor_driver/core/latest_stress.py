@@ -132,7 +132,11 @@ class LatestStress:
         if 0 <= elapsed_s < WINDOW_S:
             return
         rows = self.count - self._count_at_start
-        self.high_residual = has_high_residual(self.high_residual, self._over_limit, rows)
+        self.high_residual = has_high_residual(
+            self.high_residual,
+            self._over_limit,
+            rows,
+        )
         self._window_start = now
         self._count_at_start = self.count.copy()
         self._over_limit[:] = 0

@@ -64,7 +64,11 @@ class Layout:
     pad_size: float = PAD_SIZE
 
     def __post_init__(self) -> None:
-        positions = read_numbers(self.positions, "layout: positions (x, y, z)", LayoutError)
+        positions = read_numbers(
+            self.positions,
+            "layout: positions (x, y, z)",
+            LayoutError,
+        )
         n_pads = positions.size // 3
         if positions.shape != (n_pads, 3) or not 1 <= n_pads <= MAX_PADS:
             self._refuse(
@@ -120,7 +124,11 @@ class Layout:
         if edge > 1 + TOLERANCE:
             self._refuse(f"{pad} reaches {edge:.3g} from the face's centre; the face ends at 1")
         for other in range(number):
-            same_place = np.allclose(position, self.positions[other], atol=TOLERANCE)
+            same_place = np.allclose(
+                position,
+                self.positions[other],
+                atol=TOLERANCE,
+            )
             if same_place and np.array_equal(normal, self.normals[other]):
                 self._refuse(f"pads {other + 1} and {number + 1} coincide at {position.tolist()}")
 

@@ -154,7 +154,11 @@ class Pipeline:
             raise CalibrationError("pipeline: no calibrations; give one per cube")
         # Cubes with equal calibrations form a group, which shares its matrices.
         ids = [calibration.id for calibration in calibrations]
-        _, first, group = np.unique(ids, return_index=True, return_inverse=True)
+        _, first, group = np.unique(
+            ids,
+            return_index=True,
+            return_inverse=True,
+        )
         self._groups = tuple(calibrations[cube] for cube in first.tolist())
         self.calibrations = tuple(self._groups[number] for number in group.tolist())
         self.n_pads = max(calibration.layout.n_pads for calibration in self._groups)
@@ -248,7 +252,11 @@ class Pipeline:
             offset: Offsets o (N, P), stress / stiffness; None: those of the newest rows.
         """
         calibration = self._tables.calibration[cube]
-        factor = compute_temperature_factor(self._tables, calibration, temperature)
+        factor = compute_temperature_factor(
+            self._tables,
+            calibration,
+            temperature,
+        )
         if offset is None and self.newest_offset is not None:
             offset = self.newest_offset[cube].astype(float)
         if offset is None:

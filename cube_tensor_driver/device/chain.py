@@ -354,7 +354,11 @@ class LiveLinks:
                 self._learn_cubes(read.link, frame)
             elif isinstance(frame, Time):
                 if read.asked_ns:
-                    record.clock.add_answer(read.asked_ns, frame.device_us, read.arrival_ns)
+                    record.clock.add_answer(
+                        read.asked_ns,
+                        frame.device_us,
+                        read.arrival_ns,
+                    )
             elif isinstance(frame, Stats):
                 record.account.add_stats(frame)
             elif isinstance(frame, Ack) and frame.request == Command.START:
@@ -376,7 +380,12 @@ class LiveLinks:
         clock = record.clock
         device_us = [sample.device_us for sample in samples]
         numbers = [sample.sequence for sample in samples]
-        stamps_ns = clock.update(device_us, read.arrival_ns, numbers, read.is_late)
+        stamps_ns = clock.update(
+            device_us,
+            read.arrival_ns,
+            numbers,
+            read.is_late,
+        )
         status = STAMP if clock.in_doubt else 0
         for sample, stamp_ns in zip(samples, stamps_ns, strict=True):
             self._scans.add(read.link, sample, stamp_ns, status)
@@ -430,7 +439,12 @@ class LiveLinks:
         for problem in problems:
             record.logger.error(problem)
 
-    def _on_state(self, link: int, state: LinkState, error: LinkError | None) -> None:
+    def _on_state(
+        self,
+        link: int,
+        state: LinkState,
+        error: LinkError | None,
+    ) -> None:
         """Log a change of the state of a link, and keep it for the next report.
 
         Args:

@@ -59,7 +59,12 @@ def open_links(
     skin = as_skin(skin)
     if rate is not None:
         allowed = f"{MIN_RATE:g} to {MAX_RATE:g} samples per second"
-        check_number("rate", rate, lambda x: MIN_RATE <= x <= MAX_RATE, allowed)
+        check_number(
+            "rate",
+            rate,
+            lambda x: MIN_RATE <= x <= MAX_RATE,
+            allowed,
+        )
     links = make_link_configs(skin, port, port_directory)
     return LinkSource(skin, links, skin.rate if rate is None else rate)
 
@@ -154,7 +159,11 @@ class LinkSource:
         self._given = 0
         self._dropped = 0
         self._links = LiveLinks(
-            links, make_cube_addresses(skin), self._put, rate=rate, on_end=self._on_end
+            links,
+            make_cube_addresses(skin),
+            self._put,
+            rate=rate,
+            on_end=self._on_end,
         )
         self._links.start()
 

@@ -205,7 +205,10 @@ def _is_usable(msgtype: str) -> bool:
     return msgtype in (JOINT_STATE_TYPE, *IMAGE_TYPES) or bool(_number_paths(msgtype))
 
 
-def _read_numbers(bag: Bag, topic: Topic) -> Iterator[tuple[int, dict[str, float]]]:
+def _read_numbers(
+    bag: Bag,
+    topic: Topic,
+) -> Iterator[tuple[int, dict[str, float]]]:
     """Yield the stamp, in ns, and the numbers by their names of each message on a topic."""
     paths = _number_paths(topic.msgtype)
     messages: Iterator[tuple[int, JointState | WrenchStamped]] = bag.read_decoded({topic.name})

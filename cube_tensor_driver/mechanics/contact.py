@@ -309,7 +309,12 @@ def _compute_airy(
     inv1 = -(u**3)
     inv2 = 3 * u**5
 
-    def differentiate_twice(t2: Array, t3: Array, n1: Array, n2: Array) -> tuple[Array, Complex]:
+    def differentiate_twice(
+        t2: Array,
+        t3: Array,
+        n1: Array,
+        n2: Array,
+    ) -> tuple[Array, Complex]:
         """Return trace T and deviator D of the second derivatives of g, or their derivatives by Z.
 
         Args:

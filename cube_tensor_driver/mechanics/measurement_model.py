@@ -143,7 +143,11 @@ class CubeMeasurement:
         measured = flat @ matrices[0]
         return np.asarray(measured.reshape(n, loads, -1))
 
-    def matrices_towards(self, angle: Array, variant: Index) -> tuple[Array, Array]:
+    def matrices_towards(
+        self,
+        angle: Array,
+        variant: Index,
+    ) -> tuple[Array, Array]:
         """Return the matrices from circular components to measured components of N cubes.
 
         The measured components are in the frame of the cube. The circular components are in a frame

@@ -112,8 +112,18 @@ class TractionPrior:
         radial = spectra.radial(bessel, prior[None])[0]
         cross = radial * axis_variance[:, None]
 
-        real, imaginary = spectra.covariance(spectra, bessel, prior, SHEAR_RATIO)
-        with_points, _ = spectra.covariance(points, bessel, prior, SHEAR_RATIO)
+        real, imaginary = spectra.covariance(
+            spectra,
+            bessel,
+            prior,
+            SHEAR_RATIO,
+        )
+        with_points, _ = spectra.covariance(
+            points,
+            bessel,
+            prior,
+            SHEAR_RATIO,
+        )
         at_zero = tabulate_bessel(spectra.k, np.zeros(1))
         own, _ = points.covariance(points, at_zero, prior, SHEAR_RATIO)
         return {

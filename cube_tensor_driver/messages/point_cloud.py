@@ -78,5 +78,9 @@ def make_header(make: MakeMessage, stamp_ns: int, frame_id: str) -> object:
         frame_id: Coordinate frame.
     """
     seconds, nanoseconds = divmod(stamp_ns, SECOND)
-    stamp = make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+    stamp = make(
+        "builtin_interfaces/msg/Time",
+        sec=seconds,
+        nanosec=nanoseconds,
+    )
     return make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)

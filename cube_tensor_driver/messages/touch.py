@@ -15,7 +15,11 @@ if TYPE_CHECKING:
     from ..touch.touch_detection import Touches
 
 
-def make_touch_message(make: MakeMessage, frame_id: str, touches: Touches) -> object:
+def make_touch_message(
+    make: MakeMessage,
+    frame_id: str,
+    touches: Touches,
+) -> object:
     """Make a SkinTouch message.
 
     Args:

@@ -155,4 +155,8 @@ def list_skin_processes(
 
 
 def _make_node_process(name: str, parameters: dict[str, Value]) -> Process:
-    return Process(name, f"cube_tensor_driver.ros.nodes.{name}", parameters=dict(parameters))
+    return Process(
+        name,
+        f"cube_tensor_driver.ros.nodes.{name}",
+        parameters=dict(parameters),
+    )

@@ -274,7 +274,11 @@ class ImuMotion:
                 # The mean angular acceleration is taken as that in the middle of the interval
                 # between the samples. It is extrapolated linearly to the end of the interval, the
                 # time of the new sample.
-                means = zip(mean, before.mean_acceleration or mean, strict=True)
+                means = zip(
+                    mean,
+                    before.mean_acceleration or mean,
+                    strict=True,
+                )
                 acceleration = tuple([1.5 * now - 0.5 * then for now, then in means])
         if len(self._samples) == MAX_SAMPLES:
             self._samples = self._samples[MAX_SAMPLES // 2 :]

@@ -195,7 +195,11 @@ class CubeNode(LifecycleNode):
             raise ConfigError("parameter config is empty: name a skin file, -p config:=skin.yaml")
         return Path(self.read_value("config")).expanduser()
 
-    def make_batch_profile(self, rate_hz: float | None, n_cubes: int) -> QoSProfile:
+    def make_batch_profile(
+        self,
+        rate_hz: float | None,
+        n_cubes: int,
+    ) -> QoSProfile:
         """Return the quality of service of the topics `frequencies`, `stress` and `forces`.
 
         It depends on the parameters `publish_period` and `qos_reliability` of the node.
@@ -206,7 +210,11 @@ class CubeNode(LifecycleNode):
         """
         scans = count_scans_per_message(self.read_value("publish_period"), rate_hz)
         message_rate = None if rate_hz is None else rate_hz / scans
-        return make_batch_profile(message_rate, self.read_value("qos_reliability"), scans * n_cubes)
+        return make_batch_profile(
+            message_rate,
+            self.read_value("qos_reliability"),
+            scans * n_cubes,
+        )
 
     # These methods of rclpy register callbacks. They are overridden to catch exceptions in them.
 
@@ -270,7 +278,11 @@ class CubeNode(LifecycleNode):
             if service.srv_type is ChangeState:
                 # rclpy raises RuntimeError for a transition that is impossible now. The response
                 # then keeps its default, success=false.
-                service.callback = guard(service.callback, _give_response, RuntimeError)
+                service.callback = guard(
+                    service.callback,
+                    _give_response,
+                    RuntimeError,
+                )
             service.callback = self.callback_errors.catch_in_service(service.callback)
 
     # The following methods declare, check and apply parameters.
@@ -297,7 +309,8 @@ class CubeNode(LifecycleNode):
         self.declare_parameter(parameter.name, parameter.default, descriptor)
 
     def set_parameters_atomically(
-        self, parameter_list: list[RclpyParameter]
+        self,
+        parameter_list: list[RclpyParameter],
     ) -> SetParametersResult:
         converted = [self._as_declared(parameter) for parameter in parameter_list]
         result = super().set_parameters_atomically(converted)

@@ -168,8 +168,9 @@ class SkinSubscriberNode(CubeNode):
     def compute_message(self, skin: FollowedSkin, health: Index) -> object:
         """Return the message to publish now, or its serialised bytes; subclasses override it.
 
-        It is called `rate` times per second, or if `follow_stress` is overridden, at a message of
-        `stress` as often as that. If it returns None, nothing is published.
+        It is called by a timer `rate` times per second. If `follow_stress` is overridden, it is
+        called when stress arrives instead, at most that often. If it returns None, nothing is
+        published.
 
         Args:
             skin: The state of the skin.
@@ -209,7 +210,11 @@ class SkinSubscriberNode(CubeNode):
             due_s = max(min(due_s, now_s + period_s), now_s) + period_s
             publish(self.compute_message)
 
-        subscriber = SkinSubscriber(self, self.prepare, receive if is_followed else None)
+        subscriber = SkinSubscriber(
+            self,
+            self.prepare,
+            receive if is_followed else None,
+        )
         self.call_at_cleanup(subscriber.close)
         topic = self.get_name()
         publisher = self.own(

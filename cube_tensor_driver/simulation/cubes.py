@@ -128,7 +128,11 @@ class SimulatedCubes:
         """
         pad_stress = np.empty((len(stress), self.n_pads))
         for calibration, rows in self._groups:
-            state = compute_true_state(calibration, stress[rows], gradient[rows])
+            state = compute_true_state(
+                calibration,
+                stress[rows],
+                gradient[rows],
+            )
             pad_stress[rows] = state @ calibration.response.T
         rest, beta, modulus = self._law
         rest = rest * (1 + self._drift * seconds)

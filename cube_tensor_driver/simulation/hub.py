@@ -193,7 +193,13 @@ class SimulatedHub:
         """
         # A run of the log ends when samples are skipped or get other numbers, the period changes,
         # or the hub restarts.
-        begin = SampleRun(self.sequence, self.sequence, self.next_us, self.period_us, self.boots)
+        begin = SampleRun(
+            self.sequence,
+            self.sequence,
+            self.next_us,
+            self.period_us,
+            self.boots,
+        )
         if self.runs and self.runs[-1].is_followed_by(begin):
             self.runs[-1].last = self.sequence
         else:

@@ -98,7 +98,9 @@ _SCHEMA = Schema(
             ),
             "creep_growth": real("a growth from 0 to below 1", minimum=0, exclusiveMaximum=1),
             "creep_exponent": real(
-                "an exponent between 0 and 1", exclusiveMinimum=0, exclusiveMaximum=1
+                "an exponent between 0 and 1",
+                exclusiveMinimum=0,
+                exclusiveMaximum=1,
             ),
             "creep_spread": real("a number from 0 to below 1", minimum=0, exclusiveMaximum=1),
             "temperature": _KNOTS,

@@ -59,7 +59,8 @@ def main(
 def _make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line arguments."""
     parser = argparse.ArgumentParser(
-        prog="simulator", description="Simulated hubs of a skin on pseudo-terminals."
+        prog="simulator",
+        description="Simulated hubs of a skin on pseudo-terminals.",
     )
     add = parser.add_argument
     add(
@@ -85,7 +86,11 @@ def _make_parser() -> argparse.ArgumentParser:
         type=Path,
         help="deviations of the pads from their calibrations: YAML; docs/simulation.md",
     )
-    add("--log", type=Path, help="file for the log of the samples (JSON), written at the end")
+    add(
+        "--log",
+        type=Path,
+        help="file for the log of the samples (JSON), written at the end",
+    )
     loads = parser.add_mutually_exclusive_group()
     loads.add_argument(
         "--load",
@@ -103,7 +108,11 @@ def _make_parser() -> argparse.ArgumentParser:
         default=0,
         help="compute the load only at this number of times, and repeat them",
     )
-    add("--faults", type=Path, help="faults to carry out: YAML, a list, see docs/reliability.md")
+    add(
+        "--faults",
+        type=Path,
+        help="faults to carry out: YAML, a list, see docs/reliability.md",
+    )
     return parser
 
 

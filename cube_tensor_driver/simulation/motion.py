@@ -111,7 +111,8 @@ class MovingFrame:
         """
         times = seconds - STEP_S, seconds, seconds + STEP_S
         (origin_before, before), (origin, now), (origin_after, after) = map(
-            self._compute_pose, times
+            self._compute_pose,
+            times,
         )
         moved = origin_after - 2 * origin + origin_before
         turned = after - 2 * now + before
@@ -145,7 +146,9 @@ class HeavyPads:
     def compute_specific_force(self, seconds: float) -> Array:
         """Return the specific force (cubes, 3) in m/s² at each cube, in the frame of the cube."""
         return self._frame.compute_specific_force(
-            seconds, self._cubes.position, self._cubes.rotation
+            seconds,
+            self._cubes.position,
+            self._cubes.rotation,
         )
 
     def stress(self, seconds: float) -> Array:

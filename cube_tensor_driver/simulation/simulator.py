@@ -192,7 +192,12 @@ class Simulator:
             wait_us = self._find_due_us(report_us) - now
             wait_s = min(max(wait_us * 1e-6, 0.0), MAX_STEP_S)
             # `select` is used, because epoll rounds waiting times to milliseconds.
-            readable, _, _ = select.select([*plugged, self._fault_pipe], writers, [], wait_s)
+            readable, _, _ = select.select(
+                [*plugged, self._fault_pipe],
+                writers,
+                [],
+                wait_s,
+            )
             for fd in readable:
                 if fd == self._fault_pipe:
                     self._read_faults()
@@ -300,7 +305,11 @@ class Simulator:
             frequency = link.prepared[instant]
         else:
             stress, gradient = self._field_at(load_us)
-            frequency = link.carried.frequency(stress, gradient, time_us * 1e-6)
+            frequency = link.carried.frequency(
+                stress,
+                gradient,
+                time_us * 1e-6,
+            )
         celsius = link.carried.cubes.temperature(time_us * 1e-6)
         if not math.isnan(celsius):
             link.hub.celsius = round(100 * celsius)

@@ -197,7 +197,11 @@ class SkinPads:
             time_us: Simulated time in µs.
         """
         seconds = 1e-6 * time_us
-        frequency = np.full((len(self._cube), self._n_pads), np.nan, np.float32)
+        frequency = np.full(
+            (len(self._cube), self._n_pads),
+            np.nan,
+            np.float32,
+        )
         temperature = np.empty(len(self._cube))
         forces = []
         start = 0
@@ -206,7 +210,11 @@ class SkinPads:
             pads = hub.cubes
             rows = slice(start, start + len(cubes))
             # Frequencies from a real hub are also whole mHz.
-            millihertz = pads.frequency(stress[cubes], gradient[cubes], seconds)
+            millihertz = pads.frequency(
+                stress[cubes],
+                gradient[cubes],
+                seconds,
+            )
             frequency[rows, : pads.n_pads] = to_hertz(millihertz)
             temperature[rows] = pads.temperature(seconds)
             if pads.heavy is not None:

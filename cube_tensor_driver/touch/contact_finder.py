@@ -286,7 +286,11 @@ class _InverseFinder:
         # computed again for cubes whose pads in use have changed since the last scan.
         changed = np.flatnonzero(left_out != self._left_out)
         if len(changed):
-            by_pad = compute_noise_by_pad(self._pipeline, changed, left_out[changed])
+            by_pad = compute_noise_by_pad(
+                self._pipeline,
+                changed,
+                left_out[changed],
+            )
             self._inverse.leave_out(changed, by_pad)
             self._left_out = left_out.copy()
         if errors is not self._errors:

@@ -265,7 +265,11 @@ class SurfaceInverse:
         )
         self.near = self._windows.near
         self._known = self.observed
-        self._prediction = MissingValuePrediction(self._windows, self.observed, self._known)
+        self._prediction = MissingValuePrediction(
+            self._windows,
+            self.observed,
+            self._known,
+        )
         self.errors = np.zeros((n, len(self.columns), 0))
         self._error_variance = np.zeros((len(self.points), 2))
 
@@ -324,7 +328,9 @@ class SurfaceInverse:
             components = pads @ np.nan_to_num(own).T
             self.variant[cube] = self._cubes.add_variant(components)
             self._has_other_pads[cube] = not np.array_equal(
-                self.by_pad[cube], self._all_pads[cube], equal_nan=True
+                self.by_pad[cube],
+                self._all_pads[cube],
+                equal_nan=True,
             )
 
     def state_errors(self, errors: Array | None) -> None:
@@ -405,7 +411,11 @@ class SurfaceInverse:
         scaled = self.scale_values(values)
         return self.compute_residual_deviation(scaled, scaled)
 
-    def compute_residual_deviation(self, residual: Array, scaled: Array) -> FieldDeviation:
+    def compute_residual_deviation(
+        self,
+        residual: Array,
+        scaled: Array,
+    ) -> FieldDeviation:
         """Compute the standard deviations of the field that is computed from a residual.
 
         Args:
@@ -454,7 +464,11 @@ class SurfaceInverse:
         known = np.isfinite(scaled) & self.observed & usable
         if not np.array_equal(known, self._known):
             self._known = known
-            self._prediction = MissingValuePrediction(self._windows, self.observed, known)
+            self._prediction = MissingValuePrediction(
+                self._windows,
+                self.observed,
+                known,
+            )
         y = np.where(known, scaled, 0.0)
         single = y.astype(np.float32)
         return self._prediction.fill(single)

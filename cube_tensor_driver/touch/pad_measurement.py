@@ -198,7 +198,12 @@ def _decompose(influence: Influence) -> tuple[Spectra, Array]:
         weighted_functions = right[is_kept].reshape(n_kept, 3, -1)
         functions = weighted_functions / root
         orders += [order] * n_kept
-        transforms = _compute_hankel_transforms(functions, order, bessel, r * weight)
+        transforms = _compute_hankel_transforms(
+            functions,
+            order,
+            bessel,
+            r * weight,
+        )
         spectra.append(transforms)
         weighted = left[:, is_kept] * values[is_kept]
         pads.append(weighted.reshape(2, -1, n_kept))

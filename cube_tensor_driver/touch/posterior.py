@@ -199,7 +199,12 @@ class WindowPosteriors:
         is_single = counts[self.kind] == 1
         self._single = np.flatnonzero(is_single)
         single_kinds = self.kind[self._single]
-        by_point = self.gain.reshape(len(self.gain), len(points), ROWS_PER_POINT, -1)
+        by_point = self.gain.reshape(
+            len(self.gain),
+            len(points),
+            ROWS_PER_POINT,
+            -1,
+        )
         pressure_gain = np.ascontiguousarray(by_point[:, :, -1])
         self._gains = [(gain, gain[single_kinds]) for gain in (self.gain, pressure_gain)]
 
@@ -418,7 +423,13 @@ def _solve_window(
     blocks = precision.reshape(inner, width, inner, width)
     diagonal = blocks[cubes, :, cubes]
     inner_pads = pads[:inner]
-    trace = np.einsum("wcp,wcd,wdp->wp", inner_pads, diagonal, inner_pads, optimize=True)
+    trace = np.einsum(
+        "wcp,wcd,wdp->wp",
+        inner_pads,
+        diagonal,
+        inner_pads,
+        optimize=True,
+    )
     pressure_variance = select_pressure(variance)
     return _Window(
         gain=gain,

@@ -177,6 +177,11 @@ class MissingValuePrediction:
             neighbours = pad_variance[one.near].ravel()
             weighted = one.by_pad * neighbours
             covariance = weighted @ one.by_pad.T
-            variance = np.einsum("ncr,cd,ndr->nr", one.gain, covariance, one.gain)
+            variance = np.einsum(
+                "ncr,cd,ndr->nr",
+                one.gain,
+                covariance,
+                one.gain,
+            )
             total[one.rows] += variance
         return total

@@ -445,7 +445,11 @@ class SlipEstimator:
         variance = np.einsum("nk,nkl,nl->n", curved, covariance, curved)
         with np.errstate(invalid="ignore"):
             share = _compute_lengths(parts[:, 5:].sum(axis=1)) / change
-        return np.where(variance < (PARTIAL_DEVIATION * change) ** 2, share, np.nan)
+        return np.where(
+            variance < (PARTIAL_DEVIATION * change) ** 2,
+            share,
+            np.nan,
+        )
 
     def _test_lags(
         self,

@@ -154,7 +154,11 @@ class Surface:
         first_point = np.arange(n) * side**2
         self.middle = first_point + side // 2 * (side + 1)
 
-        self._interpolation = Interpolation(poses, self._patches, LENGTH_PER_DEPTH * depth)
+        self._interpolation = Interpolation(
+            poses,
+            self._patches,
+            LENGTH_PER_DEPTH * depth,
+        )
         self._pressure_columns = PRESSURE if gradients else PRESSURE[:1]
         # `_pairs` (pairs, 2) are the indices of neighbouring points. A distance of 1.5 times the
         # spacing includes diagonal neighbours.

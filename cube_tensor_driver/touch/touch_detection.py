@@ -219,7 +219,12 @@ class Touch:
         near = find_nearest_cubes(poses, NEIGHBOURS)
         self._estimate = None
         if skin.elastomer is not None:
-            self._estimate = estimate_forces(poses, skin.elastomer, near, covariance)
+            self._estimate = estimate_forces(
+                poses,
+                skin.elastomer,
+                near,
+                covariance,
+            )
 
         # The largest value among the neighbours is found faster if they are the first axis.
         self._near = near.T.copy()
@@ -454,7 +459,11 @@ class Touch:
         variance += (own_errors**2).sum(axis=1)
         share = margin / np.maximum(own, 1e-9)
         share = np.clip(share, 0, 1)
-        force, force_deviation = self._estimate_forces(cube, share[:, None], errors)
+        force, force_deviation = self._estimate_forces(
+            cube,
+            share[:, None],
+            errors,
+        )
         return Touches(
             stamp_ns=stamp_ns,
             cube=cube,

@@ -111,7 +111,11 @@ def find_hit_cube(
     return int(distance.argmin())
 
 
-def compute_square_corners(points: Array, rotation: Array, side: Array) -> AnyArray:
+def compute_square_corners(
+    points: Array,
+    rotation: Array,
+    side: Array,
+) -> AnyArray:
     """Return the corners (M, 4, 3) of M squares, in units of the scene.
 
     Args:

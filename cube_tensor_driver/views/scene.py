@@ -242,7 +242,11 @@ class Ranges(NamedTuple):
         )
         gradient = QUANTITIES["gradient"]
         magnitude = gradient.of(values, residual)
-        longest_gradient = choose_automatic_top(gradient, magnitude, self.gradient)
+        longest_gradient = choose_automatic_top(
+            gradient,
+            magnitude,
+            self.gradient,
+        )
         return Ranges(colours, traction, longest_gradient)
 
 

@@ -15,7 +15,11 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_argument("port", metavar="PORT", help="device path, or socket://host:port")
+    parser.add_argument(
+        "port",
+        metavar="PORT",
+        help="device path, or socket://host:port",
+    )
     parser.add_argument(
         "--baud",
         type=count,

@@ -40,7 +40,10 @@ def add_arguments(parser: Parser) -> None:
         "(default: skin_firmware.yaml of the package)",
     )
     run.add_argument(
-        "--load", type=Path, metavar="FILE", help="load script (default: an indenter that wanders)"
+        "--load",
+        type=Path,
+        metavar="FILE",
+        help="load script (default: an indenter that wanders)",
     )
     parser.add_subcommand("test", "run the tests of the firmware")
 

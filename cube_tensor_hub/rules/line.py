@@ -58,7 +58,11 @@ def nothing_but_the_bytes(transcript: Transcript) -> RuleResult:
     return passed("neither Telnet nor TLS at the beginning")
 
 
-never_tried("L4", "A connection that ends or fails is lost.", "a rule of the host")
+never_tried(
+    "L4",
+    "A connection that ends or fails is lost.",
+    "a rule of the host",
+)
 
 
 @rule(

@@ -172,7 +172,11 @@ def impossible_period(transcript: Transcript) -> RuleResult:
     return passed(f"0 µs is refused, {ack.argument} µs stay in force")
 
 
-never_tried("R5", "A HELLO with a period that is neither the one asked for", "a rule of the host")
+never_tried(
+    "R5",
+    "A HELLO with a period that is neither the one asked for",
+    "a rule of the host",
+)
 
 
 @rule(

@@ -153,4 +153,8 @@ def unknown_time(transcript: Transcript) -> RuleResult:
     return passed("this hub does not know request 6 and says so")
 
 
-never_tried("T5", "The host asks each hub about once a second", "a rule of the host")
+never_tried(
+    "T5",
+    "The host asks each hub about once a second",
+    "a rule of the host",
+)

@@ -85,7 +85,12 @@ def make_punch(width: float) -> Array:
     Args:
         width: Diameter of the punch, in m.
     """
-    sources, forces = make_flat_punch(width / 2, np.array([0, 0, 1.0]), np.zeros(2), 14)
+    sources, forces = make_flat_punch(
+        width / 2,
+        np.array([0, 0, 1.0]),
+        np.zeros(2),
+        14,
+    )
     return np.column_stack([sources[:, :2], forces[:, 2]])
 
 
@@ -100,7 +105,11 @@ def make_bar(length: float, width: float) -> Array:
     angle = np.arange(1, 9) * np.pi / 9
     across = np.sin(angle) ** 2
     across /= across.sum()
-    x, y = np.meshgrid(nodes * length / 2, np.cos(angle) * width / 2, indexing="ij")
+    x, y = np.meshgrid(
+        nodes * length / 2,
+        np.cos(angle) * width / 2,
+        indexing="ij",
+    )
     force = np.outer(along / 2, across)
     return np.column_stack([x.ravel(), y.ravel(), force.ravel()])
 
@@ -163,7 +172,14 @@ def compute_values_under(
         depth_error: How much deeper the cubes are than the inverse knows, divided by the depth.
         poisson_error: How much larger Poisson's ratio is.
     """
-    pads = _compute_pads_under(bench, forces, centre, force, depth_error, poisson_error)
+    pads = _compute_pads_under(
+        bench,
+        forces,
+        centre,
+        force,
+        depth_error,
+        poisson_error,
+    )
     return bench.measure(pads, random)
 
 
@@ -195,7 +211,9 @@ def bench_shapes(loads: int) -> TrackingResults:
 
 
 def _bench_load(
-    bench: TractionBench, shape: LoadShape, random: np.random.Generator
+    bench: TractionBench,
+    shape: LoadShape,
+    random: np.random.Generator,
 ) -> TrackingResult:
     """Find the contacts of a load in a random direction at a random place."""
     pitch = bench.setting.pitch
@@ -211,7 +229,14 @@ def _bench_load(
     turned = np.column_stack([forces[:, :2] @ turn, forces[:, 2]])
     force = draw_force(random)
     errors = random.standard_normal(2) * [DEPTH_DEVIATION, POISSON_DEVIATION]
-    values = compute_values_under(bench, turned, centre, force, random, *errors)
+    values = compute_values_under(
+        bench,
+        turned,
+        centre,
+        force,
+        random,
+        *errors,
+    )
 
     tracker = ContactTracker(bench.inverse, CONTACT_PRESSURE)
     times_ms = []
@@ -219,7 +244,12 @@ def _bench_load(
         start_s = time.process_time()
         found = tracker.update(values)
         times_ms.append(1e3 * (time.process_time() - start_s))
-    return TrackingResult(sum_contact_errors(found, centre), len(found), times_ms[0], times_ms[-1])
+    return TrackingResult(
+        sum_contact_errors(found, centre),
+        len(found),
+        times_ms[0],
+        times_ms[-1],
+    )
 
 
 def summarise(results: TrackingResults) -> dict[str, dict[str, float]]:

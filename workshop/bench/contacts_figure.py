@@ -33,7 +33,12 @@ def draw_shapes(results: TrackingResults) -> Figure:
         _draw_loads(by_load, results, skin, style)
     by_shape.invert_yaxis()
     by_shape.set(xlim=ERRORS, xlabel="force, rms error / %")
-    by_shape.legend(loc="lower center", bbox_to_anchor=(0.4, 1), ncols=3, fontsize=7)
+    by_shape.legend(
+        loc="lower center",
+        bbox_to_anchor=(0.4, 1),
+        ncols=3,
+        fontsize=7,
+    )
 
     by_load.loglog(ERRORS, ERRORS, "k-", lw=1, label="error = stated")
     by_load.loglog(ERRORS, 2 * ERRORS, "k--", lw=1, label="twice")
@@ -47,7 +52,12 @@ def draw_shapes(results: TrackingResults) -> Figure:
     return figure
 
 
-def _draw_loads(axis: Any, results: TrackingResults, skin: str, style: dict[str, Any]) -> None:
+def _draw_loads(
+    axis: Any,
+    results: TrackingResults,
+    skin: str,
+    style: dict[str, Any],
+) -> None:
     """Draw a point for each load on a skin; those without error are left out of the axes."""
     loads = [load.errors for name in SHAPES for load in results[skin, name]]
     error, deviation = 100 * np.abs(np.array(loads)[:, :2].T) / FORCE

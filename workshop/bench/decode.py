@@ -39,7 +39,14 @@ def make_clean_frames(size: int) -> bytes:
     number = 0
     while len(frames) < size:
         frequency = random.integers(90_000_000, 110_000_000, (8, 8)).astype("<u4")
-        sample = Sample(number, 0, 1000 * number, frequency, no_fault, no_temperature)
+        sample = Sample(
+            number,
+            0,
+            1000 * number,
+            frequency,
+            no_fault,
+            no_temperature,
+        )
         frames += encode(sample)
         number += 1
     return bytes(frames)

@@ -46,11 +46,17 @@ class BareSource(CubeNode):
         n = int(self.read_value("cubes"))
         rate = float(self.read_value("rate"))
         self._publisher: Any = self.create_lifecycle_publisher(  # type: ignore[no-untyped-call]
-            SkinFrequencies, "frequencies", make_batch_profile(rate)
+            SkinFrequencies,
+            "frequencies",
+            make_batch_profile(rate),
         )
         self._cube = np.arange(n, dtype=np.uint16)
         self._zeros = np.zeros(n, np.uint32)
-        self._frequency = np.full((n, int(self.read_value("pads"))), 1e5, np.float32)
+        self._frequency = np.full(
+            (n, int(self.read_value("pads"))),
+            1e5,
+            np.float32,
+        )
         self._temperature = np.full(n, np.nan, np.float32)
         self._timer = self.create_timer(1.0 / rate, self._publish)
 
@@ -80,11 +86,16 @@ class BareEcho(CubeNode):
         n = int(self.read_value("cubes"))
         quality = make_batch_profile(float(self.read_value("rate")))
         self._publisher: Any = self.create_lifecycle_publisher(  # type: ignore[no-untyped-call]
-            SkinStress, "stress", quality
+            SkinStress,
+            "stress",
+            quality,
         )
         self._zeros = np.zeros((n, GRADIENTS), np.float32)
         self._subscription = self.create_subscription(
-            SkinFrequencies, "frequencies", self._answer, quality
+            SkinFrequencies,
+            "frequencies",
+            self._answer,
+            quality,
         )
 
     def _answer(self, message: SkinFrequencies) -> None:

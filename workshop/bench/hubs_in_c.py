@@ -88,7 +88,11 @@ class HubLoad:
         return path
 
     def make_process(
-        self, folder: Path, ports: Path, rate: float, log: Path | None = None
+        self,
+        folder: Path,
+        ports: Path,
+        rate: float,
+        log: Path | None = None,
     ) -> Process:
         """Build the program of the hubs, and return how to start it.
 
@@ -114,7 +118,13 @@ class HubLoad:
         if log is not None:
             options["--log"] = log
         words = tuple(str(word) for option in options.items() for word in option)
-        return Process("hubs", "", node=False, program=str(folder / "cube_hub"), arguments=words)
+        return Process(
+            "hubs",
+            "",
+            node=False,
+            program=str(folder / "cube_hub"),
+            arguments=words,
+        )
 
 
 def read_samples(path: Path, load: HubLoad) -> SampleTable:

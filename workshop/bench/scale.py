@@ -45,7 +45,14 @@ def draw_scale(rows: list[dict[str, Any]]) -> Figure:
         left.plot(cubes, cpu_us, style, color=color, label=label, **MARKER)
     for label, key, style in LATENCY_LINES:
         latency_ms = [row[key] for row in rows]
-        right.plot(cubes, latency_ms, style, color="black", label=label, **MARKER)
+        right.plot(
+            cubes,
+            latency_ms,
+            style,
+            color="black",
+            label=label,
+            **MARKER,
+        )
     left.set(ylabel="CPU per scan / µs", title="cost of one scan of all cubes")
     right.set(ylabel="latency / ms", title="from reading the pads to receiving the tensor")
     for axes in (left, right):

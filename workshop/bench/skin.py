@@ -229,7 +229,15 @@ def _measure_skin(
 
         with Children(folder) as children:
             name = f"skin of {load.cubes} cubes"
-            measured = _measure(processes, children, bench, receive, progress, name, receive_found)
+            measured = _measure(
+                processes,
+                children,
+                bench,
+                receive,
+                progress,
+                name,
+                receive_found,
+            )
             taken, skipped = _end_load(children, log, load, bench)
     # Only rows of the first cube of each hub were stored, because storing all would delay this
     # process. They are counted for all cubes of the hub.
@@ -252,7 +260,10 @@ def _measure_skin(
 
 
 def _summarise_found(
-    bench: Bench, found: Index, taken: SampleTable, measured: Measurement
+    bench: Bench,
+    found: Index,
+    taken: SampleTable,
+    measured: Measurement,
 ) -> dict[str, float]:
     """Return number and latencies of the messages of a topic that has no sequence number.
 
@@ -295,14 +306,22 @@ def _make_processes(
     if bench.has_load:
         processes[0] = replace(processes[0], executable=LOAD)
     else:
-        processes[0] = load.make_process(path.parent / "firmware", ports, bench.rate, log)
+        processes[0] = load.make_process(
+            path.parent / "firmware",
+            ports,
+            bench.rate,
+            log,
+        )
     if bench.topic == "contacts":
         processes[-1].parameters["rate"] = min(bench.rate, MAX_CONTACT_RATE_HZ)
     return processes
 
 
 def _end_load(
-    children: Children, log: Path, load: HubLoad, bench: Bench
+    children: Children,
+    log: Path,
+    load: HubLoad,
+    bench: Bench,
 ) -> tuple[SampleTable, int]:
     """End the hubs; return their samples, and the number that they dropped from full queues."""
     children.end([LOAD])
@@ -334,7 +353,14 @@ def _measure_echo(
     ):
         part = replace(bench, duration=min(bench.duration / 2, MAX_ECHO_S))
         name = f"echo of {cubes} cubes"
-        measured = _measure(processes, children, part, lambda data: None, progress, name)
+        measured = _measure(
+            processes,
+            children,
+            part,
+            lambda data: None,
+            progress,
+            name,
+        )
     return {"echo_cpu_percent": round(sum(measured.cpu_percent.values()), 1)}
 
 
@@ -378,7 +404,12 @@ def _measure(
         receive(data)
 
     with observe_skin("bench", children) as observer:
-        observer.listen(SkinStress, "stress", on_stress, make_batch_profile(bench.rate))
+        observer.listen(
+            SkinStress,
+            "stress",
+            on_stress,
+            make_batch_profile(bench.rate),
+        )
         if receive_found is not None and bench.topic:
             kind, profile = FOUND[bench.topic], make_batch_profile(bench.rate)
             observer.listen(kind, bench.topic, receive_found, profile)
@@ -400,7 +431,13 @@ def _measure(
         end_ns, cpu_percent = time.time_ns(), usage.measure_cpu_percent()
         observer.spin(DRAIN_S)
     progress.remove_task(task)
-    return Measurement(start_ns, end_ns, cpu_percent, memory_mb, first_tensor_s)
+    return Measurement(
+        start_ns,
+        end_ns,
+        cpu_percent,
+        memory_mb,
+        first_tensor_s,
+    )
 
 
 def summarise_memory(memory_mb: dict[str, list[float]]) -> dict[str, float]:

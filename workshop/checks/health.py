@@ -192,7 +192,11 @@ class _Evidence:
         rows = self._run.record.stress.rows
         has_arrived = (rows.cube == cube) & span.contains(rows.stamp_ns)
         begin = Span(span.begin_ns, span.begin_ns)
-        is_near = begin.contains(samples.time_ns, NOMINAL_PERIOD_S, NOMINAL_PERIOD_S)
+        is_near = begin.contains(
+            samples.time_ns,
+            NOMINAL_PERIOD_S,
+            NOMINAL_PERIOD_S,
+        )
         # If the rate changes in this time, the longest period gives the smallest number of rows.
         period_us = int(samples.period_us[is_near].max(initial=1))
         expected = (span.end_ns - span.begin_ns) / (1000 * period_us)

@@ -89,7 +89,11 @@ class RestHistory:
         actions = self._run.record.select_actions("tare", "clear")
         return [action for action in actions if action.succeeded]
 
-    def _apply(self, action: NodeAction, current: RestFrequencies) -> RestFrequencies:
+    def _apply(
+        self,
+        action: NodeAction,
+        current: RestFrequencies,
+    ) -> RestFrequencies:
         if action.kind == "clear":
             return self._calibrated
         # A tare has a known result only if the load was constant in all data that it averages.
@@ -116,7 +120,12 @@ class RestHistory:
         """Find the times (N,) at which either the old or the new rest frequencies may be in
         force."""
         record = self._run.record
-        is_unclear = record.is_during(RECONSTRUCTION_STOPS, sent_ns, TRANSPORT_S, RESTORE_S)
+        is_unclear = record.is_during(
+            RECONSTRUCTION_STOPS,
+            sent_ns,
+            TRANSPORT_S,
+            RESTORE_S,
+        )
         for action in self._find_changes():
             is_unclear |= action.contains(sent_ns, TRANSPORT_S, TRANSPORT_S)
         return is_unclear

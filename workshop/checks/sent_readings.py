@@ -102,7 +102,11 @@ class SentReadings:
         # The decoder computes the same float32 product, so that the results must have equal bits.
         temperature = hundredths.astype(np.float32) * np.float32(0.01)
         temperature[hundredths == TEMPERATURE_UNKNOWN] = np.nan
-        return Readings(frequency, temperature, readings["pad_fault"][row, on_hub])
+        return Readings(
+            frequency,
+            temperature,
+            readings["pad_fault"][row, on_hub],
+        )
 
     def find_held(self, cubes: list[int], span: Span) -> Array | None:
         """Return the constant readings of cubes of one link in a span of time.

@@ -23,7 +23,11 @@ def add_arguments(parser: Parser) -> None:
         "the core against the same equations and matrix product in bare numpy",
         cubes=1260,
     )
-    _add(parser, "decode", "the decoder on clean frames and all kinds of noise, GB/s")
+    _add(
+        parser,
+        "decode",
+        "the decoder on clean frames and all kinds of noise, GB/s",
+    )
     _add(
         parser,
         "links",
@@ -53,7 +57,12 @@ def add_arguments(parser: Parser) -> None:
         timed=True,
     )
 
-    scale = _add(parser, "scale", "skin for growing numbers of cubes, with a picture", timed=True)
+    scale = _add(
+        parser,
+        "scale",
+        "skin for growing numbers of cubes, with a picture",
+        timed=True,
+    )
     scale.add_argument(
         "--counts",
         type=count,
@@ -143,7 +152,9 @@ def _add(
 
 def _add_chain(parser: Parser) -> None:
     parser.add_argument(
-        "--composed", action="store_true", help="run driver and reconstruction in one process"
+        "--composed",
+        action="store_true",
+        help="run driver and reconstruction in one process",
     )
     parser.add_argument(
         "--publish-period",

@@ -39,7 +39,11 @@ def run(options: argparse.Namespace) -> int:
     from ..torture.torture import run_mutations, run_torture
 
     if options.mutate is not None:
-        return run_mutations(options.mutate, seed=options.seed, json_path=options.json)
+        return run_mutations(
+            options.mutate,
+            seed=options.seed,
+            json_path=options.json,
+        )
     return run_torture(
         duration=options.duration,
         seed=options.seed,

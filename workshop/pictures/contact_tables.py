@@ -82,7 +82,12 @@ def compute_contact_tables(true_pads: Influence) -> dict[str, object]:
         f"{setting.cubes}, pitch {1e3 * setting.pitch:g} mm": errors
         for setting, errors in balls.items()
     }
-    wrong = study_tractions(list(WRONG.values()), WRONG_WIDTHS, FEW_LOADS, SEED)
+    wrong = study_tractions(
+        list(WRONG.values()),
+        WRONG_WIDTHS,
+        FEW_LOADS,
+        SEED,
+    )
     by_assumption = {name: wrong[setting] for name, setting in WRONG.items()}
     forms = study_pads(true_pads, WIDTHS, PAD_LOADS, SEED)
     by_form = {f"{setting.cubes} as {form}": errors for (setting, form), errors in forms.items()}
@@ -94,7 +99,10 @@ def compute_contact_tables(true_pads: Influence) -> dict[str, object]:
     }
 
 
-def _make_table(results: Mapping[str, Sequence[Errors]], loads: int) -> dict[str, object]:
+def _make_table(
+    results: Mapping[str, Sequence[Errors]],
+    loads: int,
+) -> dict[str, object]:
     """Return the table of the errors of each skin and width, from a number of loads for each."""
     rows = {}
     for name, all_widths in results.items():

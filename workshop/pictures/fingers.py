@@ -60,7 +60,11 @@ def draw_fingers(
     lowest, highest = np.nanmin(values_kpa), np.nanmax(values_kpa)
 
     figure = Figure(figsize=(9, 4.4))
-    robot, *axes = figure.subplots(1, 1 + len(fingers), width_ratios=[1.9] + [1.0] * len(fingers))
+    robot, *axes = figure.subplots(
+        1,
+        1 + len(fingers),
+        width_ratios=[1.9] + [1.0] * len(fingers),
+    )
     robot.imshow(pixels)
     robot.set_axis_off()
     for axis, (name, cubes) in zip(axes, fingers.items(), strict=True):
@@ -76,12 +80,20 @@ def draw_fingers(
             rasterized=True,
         )
         _draw_shear(axis, parts[name], 1e-3 * values[cubes])
-        axis.set(title=f"{name} finger\n\n", xlabel="$x$ / mm", aspect="equal")
+        axis.set(
+            title=f"{name} finger\n\n",
+            xlabel="$x$ / mm",
+            aspect="equal",
+        )
         axis.grid(False)
         # Room for the arrows at the edges.
         axis.margins(0.22, 0.1)
     axes[0].set_ylabel("$z$ / mm")
-    figure.colorbar(image, ax=axes, label="pressure in the cubes' plane / kPa")
+    figure.colorbar(
+        image,
+        ax=axes,
+        label="pressure in the cubes' plane / kPa",
+    )
     return figure
 
 
@@ -108,4 +120,12 @@ def _draw_shear(
         width=0.012,
     )
     label = f"shear {ARROW_KPA:g} kPa"
-    axis.quiverkey(arrows, 0.5, 1.04, ARROW_KPA, label, color="black", labelpos="N")
+    axis.quiverkey(
+        arrows,
+        0.5,
+        1.04,
+        ARROW_KPA,
+        label,
+        color="black",
+        labelpos="N",
+    )

@@ -236,13 +236,18 @@ class Actions:
         self._on_driver_killed()
         self._children.start(self._processes["driver"])
         self._observer.spin(
-            MAX_START_S, lambda: bool(self._find_publishers(TRANSITIONS) - dead_transitions)
+            MAX_START_S,
+            lambda: bool(self._find_publishers(TRANSITIONS) - dead_transitions),
         )
         if not self._activate_driver(dead, lambda: True):
             return False, self._children.log("driver")[-500:]
         return self._wait_for_stress()
 
-    def _activate_driver(self, dead: set[bytes], is_ready: Callable[[], bool]) -> bool:
+    def _activate_driver(
+        self,
+        dead: set[bytes],
+        is_ready: Callable[[], bool],
+    ) -> bool:
         """Configure the driver, and activate it when all of its subscribers have discovered it.
 
         Args:

@@ -101,7 +101,11 @@ class TcpLine(SimulatedLine):
             self._connection, _ = self._listener.accept()
             self._connection.setblocking(False)
             # Without this option, TCP would delay samples to send several of them together.
-            self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._connection.setsockopt(
+                socket.IPPROTO_TCP,
+                socket.TCP_NODELAY,
+                1,
+            )
             self.fd = self._connection.fileno()
 
     def _hang_up(self) -> None:

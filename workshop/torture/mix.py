@@ -126,13 +126,25 @@ class _Mix:
         while (at := at + random.exponential(0.15)) < self._duration:
             kind = str(random.choice(FRAME_FAULTS))
             hub = int(random.integers(HUBS))
-            self._add_fault(at, hub, kind=kind, count=int(random.integers(1, 6)))
+            self._add_fault(
+                at,
+                hub,
+                kind=kind,
+                count=int(random.integers(1, 6)),
+            )
 
     def add_opening(self) -> None:
         """Add one fault of each kind to the pads of a hub, and a warm hub."""
         for kind, cube in zip(PAD_FAULTS, OPENING_CUBES, strict=True):
             pad = int(self._random.integers(PADS))
-            self._add_fault(0.5, OPENING_HUB, kind=kind, cube=cube, pad=pad, seconds=1.8)
+            self._add_fault(
+                0.5,
+                OPENING_HUB,
+                kind=kind,
+                cube=cube,
+                pad=pad,
+                seconds=1.8,
+            )
         self._add_fault(1.5, 1, kind="temperature", value=5.0, seconds=1.0)
         # A hub keeps its temperature until the next fault of this kind, here back to normal.
         self._add_fault(4.5, 1, kind="temperature", value=0.0)
@@ -188,7 +200,13 @@ class _Mix:
         random, at = self._random, 0.0
         while (at := at + random.uniform(8.0, 25.0)) < self._end - 1:
             hub, value = int(random.integers(1, HUBS)), round(random.uniform(1.0, 10.0), 2)
-            self._add_fault(at, hub, kind="temperature", value=value, seconds=2.0)
+            self._add_fault(
+                at,
+                hub,
+                kind="temperature",
+                value=value,
+                seconds=2.0,
+            )
             self._add_fault(at + 3.0, hub, kind="temperature", value=0.0)
 
 

@@ -107,7 +107,12 @@ def play(
         with record_torture(skin, children, interrupted, memory) as recorder:
             observer, stress = recorder.observer, recorder.stress
             actions = Actions(
-                observer, children, processes, skin, stress, recorder.on_driver_killed
+                observer,
+                children,
+                processes,
+                skin,
+                stress,
+                recorder.on_driver_killed,
             )
             actions.start_driver(ports / FAULT_PIPE)
             begin_ns = time.time_ns()
@@ -122,7 +127,13 @@ def play(
 
             # All threads exist when tensors arrive; further ones later are leaks.
             threads = memory.count_threads()
-            _carry_out(observer, actions, ports / FAULT_PIPE, schedule(duration, seed), duration)
+            _carry_out(
+                observer,
+                actions,
+                ports / FAULT_PIPE,
+                schedule(duration, seed),
+                duration,
+            )
             observer.spin(SETTLE_S - ARRIVAL_S)
             # The last samples may still be on their way, so they are not checked.
             end_ns = time.time_ns() - round(NS_PER_S * UNCHECKED_S)

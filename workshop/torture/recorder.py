@@ -97,7 +97,11 @@ class TopicLog(Generic[AnyRows]):
         self._codec: MessageCodec[AnyRows] = codec
         self._frame_id = skin.parent_frame.encode() + b"\0"
         self._subscription: Any = node.create_subscription(
-            kind, topic, lambda _: None, quality, raw=True
+            kind,
+            topic,
+            lambda _: None,
+            quality,
+            raw=True,
         )
         self._messages: list[Message] = []
         self._last_number = 0
@@ -173,7 +177,12 @@ class TopicLog(Generic[AnyRows]):
             raise MessageError("the driver or the reconstruction published nothing: see their logs")
         first_row = np.cumsum([0, *n_rows]).tolist()
         gaps = tuple((first_row[before], missing) for before, missing in self._gaps)
-        return Received(concatenate(decoded), np.repeat(sent_ns, n_rows), gaps, unreadable)
+        return Received(
+            concatenate(decoded),
+            np.repeat(sent_ns, n_rows),
+            gaps,
+            unreadable,
+        )
 
     def _find_batch(self, item: tuple[int, Message]) -> tuple[int, int, bytes]:
         """Return what successive messages that are decoded together have in common."""
@@ -207,9 +216,21 @@ class TortureRecorder:
         quality = make_batch_profile(RATE)
         quality.depth = QUEUE_DEPTH
         self._frequencies = TopicLog(
-            node, SkinFrequencies, "frequencies", quality, frequency_codec, skin
+            node,
+            SkinFrequencies,
+            "frequencies",
+            quality,
+            frequency_codec,
+            skin,
         )
-        self.stress = TopicLog(node, SkinStress, "stress", quality, stress_codec, skin)
+        self.stress = TopicLog(
+            node,
+            SkinStress,
+            "stress",
+            quality,
+            stress_codec,
+            skin,
+        )
 
         self._links: dict[str, dict[str, str]] = {}
         self._totals: dict[str, str] = {}
@@ -220,7 +241,10 @@ class TortureRecorder:
         self._messages_lost = [0]
         self._n_messages, self._last_message_s = 0, time.monotonic()
         observer.node.create_subscription(
-            DiagnosticArray, "/diagnostics", self._on_diagnostics, 1000
+            DiagnosticArray,
+            "/diagnostics",
+            self._on_diagnostics,
+            1000,
         )
 
     def take(self) -> None:

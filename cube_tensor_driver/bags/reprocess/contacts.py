@@ -138,8 +138,16 @@ class ContactWriter:
             time_ns = int(recorded_ns[number])
             touches = self._touch(rows)
             for found in touches:
-                message = make_touch_message(make_message, self._frame_id, found)
-                self._writer.write(self._touches, time_ns, serialise(TOUCH, message))
+                message = make_touch_message(
+                    make_message,
+                    self._frame_id,
+                    found,
+                )
+                self._writer.write(
+                    self._touches,
+                    time_ns,
+                    serialise(TOUCH, message),
+                )
             newest = touches[-1] if touches else NO_TOUCHES
             self._write(stamp_ns, time_ns, newest)
 
@@ -192,7 +200,11 @@ class ContactWriter:
             finder.slip,
             finder.touch_id,
         )
-        self._writer.write(self._contacts, recorded_ns, serialise(CONTACTS, message))
+        self._writer.write(
+            self._contacts,
+            recorded_ns,
+            serialise(CONTACTS, message),
+        )
         cloud = finder.make_cloud(values) if is_due else None
         if cloud is not None:
             message = make_traction_message(
@@ -201,4 +213,8 @@ class ContactWriter:
                 self._frame_id,
                 cloud,
             )
-            self._writer.write(self._traction, recorded_ns, serialise(TRACTION, message))
+            self._writer.write(
+                self._traction,
+                recorded_ns,
+                serialise(TRACTION, message),
+            )

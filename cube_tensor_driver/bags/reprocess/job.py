@@ -213,7 +213,11 @@ def reconstruct(
         if use_health:
             reconstructor.compensation.restore(segment.states)
         try:
-            stress = reconstruct_rows(reconstructor, segment.messages.rows, segment.health)
+            stress = reconstruct_rows(
+                reconstructor,
+                segment.messages.rows,
+                segment.health,
+            )
         except CubeError as error:
             # These messages do not fit the skin, for example in the number of pads. The ROS node
             # leaves them out, too.
@@ -298,7 +302,11 @@ def _write_skin(
         contacts = ContactWriter(writer, skin, job.contacts)
     for segment, stress in reconstruct(source, settings):
         messages = segment.messages
-        encoded = stress_codec.encode(stress, messages.stamp_ns, messages.frame_id)
+        encoded = stress_codec.encode(
+            stress,
+            messages.stamp_ns,
+            messages.frame_id,
+        )
         times_ns = segment.recorded_ns.tolist()
         for time_ns, data in zip(times_ns, encoded, strict=True):
             writer.write(f"{skin}stress", time_ns, data)
@@ -354,7 +362,11 @@ def _recalibrate(
         # A rest frequency that differs from the old calibration was measured by a tare (without
         # load) and is kept. An equal one came from the old calibration and is replaced.
         pads = rest[: old.layout.n_pads]
-        pads[:] = np.where(pads != old.rest_frequency, pads, new.rest_frequency)
+        pads[:] = np.where(
+            pads != old.rest_frequency,
+            pads,
+            new.rest_frequency,
+        )
     return Settings(tuple(calibrations), rest_frequency)
 
 
@@ -409,7 +421,11 @@ def _measure_rest(
         if not len(rows):
             continue
         cube = cube[inside]
-        factor = pipeline.compute_unloaded_factor(cube, rows.temperature, offset[inside])
+        factor = pipeline.compute_unloaded_factor(
+            cube,
+            rows.temperature,
+            offset[inside],
+        )
         frequency = rows.frequency / factor
         pads = np.arange(frequency.shape[1])
         is_faulty = rows.pad_fault[:, np.newaxis] >> pads & 1 > 0

@@ -192,7 +192,10 @@ def _read_recorded_health(columns: dict[str, pyarrow.Array]) -> RecordedHealth |
     )
 
 
-def _restore(reconstructor: Reconstructor, columns: dict[str, pyarrow.Array]) -> None:
+def _restore(
+    reconstructor: Reconstructor,
+    columns: dict[str, pyarrow.Array],
+) -> None:
     """Set recorded rest frequencies and states of creep and temperature in a reconstructor.
 
     Args:

@@ -139,7 +139,11 @@ class Compensation:
         np.add(thermal, self.creep.offset, out=self.offsets.offset)
         # The kernel multiplies the gain by the whole reading of a pad, but creep depends only on
         # the reading minus the effect of temperature. The slope contains the difference.
-        np.subtract(self.creep.slope, self.creep.gain * thermal, out=self.offsets.slope)
+        np.subtract(
+            self.creep.slope,
+            self.creep.gain * thermal,
+            out=self.offsets.slope,
+        )
         self.offsets.gain[:] = self.creep.gain
         self.offsets.lasting[:] = 0
         for effect in self._lasting:

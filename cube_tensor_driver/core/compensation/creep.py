@@ -85,7 +85,11 @@ class Creep:
         amplitude = tabulate(models, "amplitude", (n_pads, 0))
         self._amplitude = np.ascontiguousarray(np.moveaxis(amplitude, 2, 0))
         # Errors of the amplitudes by independent causes (C, causes, P, K).
-        self._amplitude_errors = tabulate(models, "deviation", (0, n_pads, len(time)))
+        self._amplitude_errors = tabulate(
+            models,
+            "deviation",
+            (0, n_pads, len(time)),
+        )
         # A cube with fewer relaxation times than another one has the amplitude 0 for the rest.
         self._memories = LowPass(np.where(time > 0, time, 1.0), self._amplitude)
         self.offset, self.slope, self.gain = self._memories.sums
@@ -123,7 +127,12 @@ class Creep:
         ahead_s = np.maximum(end_ns - newest_ns, STEP_NS) * 1e-9
         # Before the first row of a cube, its reading is unknown. Infinity makes slope and gain 0.
         ahead_s[newest_ns == 0] = np.inf
-        share = self._memories.advance(elapsed_ns * 1e-9, self._reading, now, ahead_s)
+        share = self._memories.advance(
+            elapsed_ns * 1e-9,
+            self._reading,
+            now,
+            ahead_s,
+        )
         # Over the interval, each filter replaces this share of its output by the readings of the
         # interval. The unknown fraction of these readings is 0 or, in a gap, 1.
         self._unknown += share * (is_gap - self._unknown)
@@ -166,9 +175,17 @@ class Creep:
         newest = np.nan_to_num(self._newest.reading[cubes])
         larger = np.maximum(np.abs(reading), np.abs(newest))
         largest = self._total[cubes] * larger * stiffness * UNIFORM_DEVIATION
-        unknown = np.where(is_gap[cubes, None], largest, self._find_unknown(cubes))
+        unknown = np.where(
+            is_gap[cubes, None],
+            largest,
+            self._find_unknown(cubes),
+        )
         memory = reading - self._memories.lag[:, cubes]
-        by_law = np.einsum("nspk,knp->nps", self._amplitude_errors[cubes], memory)
+        by_law = np.einsum(
+            "nspk,knp->nps",
+            self._amplitude_errors[cubes],
+            memory,
+        )
         return np.dstack([unknown, by_law * stiffness[..., None]])
 
     def _update_certainty(self) -> None:
@@ -228,7 +245,12 @@ class Creep:
         # minus low-passed reading, changes by the unknown fraction of the shift.
         self._memories.lag -= self._unknown[..., None] * shift
         largest = self._largest_unknown
-        np.minimum(largest, np.abs(self._reading), out=largest, where=shift != 0)
+        np.minimum(
+            largest,
+            np.abs(self._reading),
+            out=largest,
+            where=shift != 0,
+        )
         return bool(shift.any())
 
     def collect_parts(self) -> list[Array]:

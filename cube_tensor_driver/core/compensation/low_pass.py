@@ -106,7 +106,13 @@ class LowPass:
         self.sums = np.zeros((3, *weight.shape[1:]))
         self.output, self.slope, self.gain = self.sums
 
-    def advance(self, elapsed_s: Real, before: Array, now: Array, ahead_s: Real) -> Array:
+    def advance(
+        self,
+        elapsed_s: Real,
+        before: Array,
+        now: Array,
+        ahead_s: Real,
+    ) -> Array:
         """Advance the filters by one interval for each cube, and compute the sums.
 
         Args:

@@ -80,7 +80,14 @@ class ForcesAtCubes:
         cube = np.ascontiguousarray(rows.cube)
         stamp_ns = np.ascontiguousarray(rows.stamp_ns, np.int64)
         force = np.empty((len(rows), 3), np.float32)
-        find_forces(*motion, self._position, self._rotation, cube, stamp_ns, force)
+        find_forces(
+            *motion,
+            self._position,
+            self._rotation,
+            cube,
+            stamp_ns,
+            force,
+        )
         # A call of the class takes a third of the time of `dataclasses.replace`.
         return FrequencyRows(
             rows.cube,

@@ -86,7 +86,11 @@ class Thermal:
         )
         # Coefficients divided by the stiffness of the pads, the highest power first (D, C, P), for
         # Horner's scheme; 0 for a pad that the cube does not have.
-        stiffness = np.where(pipeline.stiffness > 0, pipeline.stiffness, np.inf)
+        stiffness = np.where(
+            pipeline.stiffness > 0,
+            pipeline.stiffness,
+            np.inf,
+        )
         self._relative = np.moveaxis(self._coefficient, 2, 0)[::-1] / stiffness
         self._endless = np.full(n_cubes, np.inf)
 
@@ -173,8 +177,16 @@ class Thermal:
         temperature = self._filters.output[cubes]
         behind = self._measured[cubes, None] - temperature
         is_measured = ~np.isnan(behind)
-        unknown = np.where(is_measured, self._unknown[cubes, None], LOST_KELVIN)
-        level = np.where(is_measured, temperature - self._reference[cubes, None], 0)
+        unknown = np.where(
+            is_measured,
+            self._unknown[cubes, None],
+            LOST_KELVIN,
+        )
+        level = np.where(
+            is_measured,
+            temperature - self._reference[cubes, None],
+            0,
+        )
         powers = 1 + np.arange(self._deviation.shape[2])
         by_cause = (
             (self._coefficient[..., :1], unknown),

@@ -145,7 +145,11 @@ class DriftTracker:
         """
         is_unloaded: Mask = np.asarray(follows.any(axis=1))
         self._followed_windows += is_unloaded
-        self._loaded_windows = np.where(is_unloaded, 0, self._loaded_windows + 1)
+        self._loaded_windows = np.where(
+            is_unloaded,
+            0,
+            self._loaded_windows + 1,
+        )
         change_since_tare = self._tracked_rest / self._tared_rest - 1
         drift = np.nanmean(change_since_tare, axis=1)
         for cubes in self._layouts:
@@ -198,12 +202,20 @@ class DriftTracker:
             has_rows: Whether the cube had rows in the window (cubes,).
         """
         counted = np.where(at_rest, self._unloaded_windows + 1, 0)
-        self._unloaded_windows = np.where(has_rows, counted, self._unloaded_windows)
+        self._unloaded_windows = np.where(
+            has_rows,
+            counted,
+            self._unloaded_windows,
+        )
 
     def _update_when_due(self) -> None:
         """Give the tracked rest frequencies to the pipeline every `WINDOWS_PER_UPDATE` windows."""
         self._windows += 1
-        unchanged = np.array_equal(self._tracked_rest, self._rest_in_use, equal_nan=True)
+        unchanged = np.array_equal(
+            self._tracked_rest,
+            self._rest_in_use,
+            equal_nan=True,
+        )
         if self._windows % WINDOWS_PER_UPDATE == 0 and not unchanged:
             self._rest_in_use = self._pipeline.rest_frequency = self._tracked_rest
             self._health.refresh()

@@ -164,7 +164,12 @@ class Health:
         rows = columns.select(scan)
         cube = rows.cube.astype(np.intp)
         f = rows.frequency.astype(np.float32)
-        is_impossible, is_reported = find_impossible(tables, self.sums, rows, cube)
+        is_impossible, is_reported = find_impossible(
+            tables,
+            self.sums,
+            rows,
+            cube,
+        )
         causes = np.where(f >= self._open[cube], OPEN, RANGE)
         # The comparison is also false for NaN, which stands for a pad without a frequency.
         causes = np.where(f > 0, causes, SHORT)
@@ -193,7 +198,11 @@ class Health:
         found = self.diagnosis.examine(window, self.state)
         self._set_bound()
         over_limit = self.sums.cubes["over_limit"]
-        self.high_residual = has_high_residual(self.high_residual, over_limit, window.rows)
+        self.high_residual = has_high_residual(
+            self.high_residual,
+            over_limit,
+            window.rows,
+        )
         self._had_high_residual |= self.high_residual
         self._conditions.end_window(found, window.rows > 0)
 

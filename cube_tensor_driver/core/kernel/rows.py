@@ -98,7 +98,11 @@ def apply_law(
         Pad stresses divided by the stiffness E (1 + beta) / beta (N, P), 0 for bad pads, and
         whether the frequency lies in the range of the law, 0 < f < f_highest (N, P).
     """
-    factor = compute_temperature_factor(tables, tables.calibration[cube], temperature)
+    factor = compute_temperature_factor(
+        tables,
+        tables.calibration[cube],
+        temperature,
+    )
     rest = (tables.rest[cube] * factor).astype(frequency.dtype)
     highest = (tables.highest[cube] * factor).astype(frequency.dtype)
     below = highest - frequency
@@ -201,7 +205,12 @@ def _process(scan: slice, task: Task) -> tuple[int, int]:
         left_out = rows.pad_fault | state["mask"]
         np.copyto(out.left_out, left_out, where=is_assessed)
         np.copyto(out.status, state["status"], where=is_assessed)
-        is_impossible, is_reported = find_impossible(tables, health, rows, cube)
+        is_impossible, is_reported = find_impossible(
+            tables,
+            health,
+            rows,
+            cube,
+        )
         new_conditions = pack_bits(is_impossible | is_reported) & ~state["found"]
         has_new_condition = new_conditions != 0
 
@@ -429,7 +438,11 @@ def _measure_pace(
     gap_within = state["gap_within"][cube]
     is_longer = np.abs(between) > np.abs(gap_within)
     is_longest = is_gap & ~is_first & is_longer
-    state["gap_before"][cube] = np.where(is_gap & is_first, between, gap_before)
+    state["gap_before"][cube] = np.where(
+        is_gap & is_first,
+        between,
+        gap_before,
+    )
     state["gap_within"][cube] = np.where(is_longest, between, gap_within)
 
     shorter = np.minimum(now, before)

@@ -24,7 +24,9 @@ class HostClockWatch:
     """
 
     def __init__(
-        self, clock_ns: Callable[[], int], steady_ns: Callable[[], int] = time.monotonic_ns
+        self,
+        clock_ns: Callable[[], int],
+        steady_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._clock_ns = clock_ns
         self._steady_ns = steady_ns

@@ -128,7 +128,11 @@ class HubClock:
             return
         device_ns = 1000.0 * (device_us - self.track.first_us)
         sent = sent_ns - self.track.first_ns
-        is_good = self.line.add_round_trip(device_ns, sent, arrival_ns - self.track.first_ns)
+        is_good = self.line.add_round_trip(
+            device_ns,
+            sent,
+            arrival_ns - self.track.first_ns,
+        )
         self._n_bad_answers = 0 if is_good else self._n_bad_answers + 1
         if self._n_bad_answers >= MAX_BAD_ANSWERS:
             self.problems.add(BAD_ANSWERS)
@@ -281,7 +285,8 @@ class HubClock:
         arrival = arrival_ns - track.first_ns
         if self._step_us:
             self._decide(
-                self.line.compute_height(1000 * (newest_us - track.first_us), arrival), arrival_ns
+                self.line.compute_height(1000 * (newest_us - track.first_us), arrival),
+                arrival_ns,
             )
         # While the hub's clock stands still, or a step is undecided, delays are unknown.
         if not self._is_still and not self._step_us:
@@ -291,7 +296,12 @@ class HubClock:
         self.in_doubt |= bool(problem or self._step_us)
         return not problem
 
-    def _convert(self, times: Sequence[int], arrival_ns: int, is_late: bool) -> list[int]:
+    def _convert(
+        self,
+        times: Sequence[int],
+        arrival_ns: int,
+        is_late: bool,
+    ) -> list[int]:
         """Fit the line to samples without a step between them, and return their stamps.
 
         Args:

@@ -124,7 +124,12 @@ class ClockLine:
         # A bucket whose samples were all read late has no point.
         return math.isfinite(height) and self._add_bucket(height)
 
-    def add_round_trip(self, device_ns: float, sent_ns: int, arrival_ns: int) -> bool:
+    def add_round_trip(
+        self,
+        device_ns: float,
+        sent_ns: int,
+        arrival_ns: int,
+    ) -> bool:
         """Bound the offset at one device time by one round trip.
 
         Args:
@@ -142,8 +147,16 @@ class ClockLine:
         # The bounds from earlier answers are extrapolated with the drift to the device time of
         # this answer, and widened by the possible error of the drift.
         drifted = drift * elapsed
-        low = max(sent_ns - device_ns, self._low + drifted - tolerance, line - MAX_DELAY_NS)
-        high = min(arrival_ns - device_ns, self._high + drifted + tolerance, line + MAX_FALL_NS)
+        low = max(
+            sent_ns - device_ns,
+            self._low + drifted - tolerance,
+            line - MAX_DELAY_NS,
+        )
+        high = min(
+            arrival_ns - device_ns,
+            self._high + drifted + tolerance,
+            line + MAX_FALL_NS,
+        )
         if low > high:
             return False
         self._low, self._high, self._answered_ns = low, high, device_ns

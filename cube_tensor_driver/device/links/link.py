@@ -385,7 +385,8 @@ class Link:
         """
         paths = self._matches()
         error = LinkError(
-            f"no port matches {self.config.port}: plug the hub in or correct the pattern", "no_port"
+            f"no port matches {self.config.port}: plug the hub in or correct the pattern",
+            "no_port",
         )
         for i in range(len(paths)):
             self.path = paths[(self._first_match + i) % len(paths)]
@@ -455,14 +456,20 @@ def _open_port(path: str, baud: int) -> serial.Serial:
         # inter_byte_timeout=0 makes pyserial set the terminal's VMIN to 1. Then reading a port
         # without data fails with EAGAIN, and an empty result always means an unplugged hub.
         port = serial.Serial(
-            path, baud, timeout=0, write_timeout=0, inter_byte_timeout=0, exclusive=True
+            path,
+            baud,
+            timeout=0,
+            write_timeout=0,
+            inter_byte_timeout=0,
+            exclusive=True,
         )
     except (OSError, _find_terminal_error()) as error:
         raise explain_open_error(path, error) from error
     except ValueError as error:
         kind = "bad_baud" if "baud" in str(error).lower() else "bad_port"
         raise LinkError(
-            f"{path} at {baud} baud: {error}: correct the port or the baud rate", kind
+            f"{path} at {baud} baud: {error}: correct the port or the baud rate",
+            kind,
         ) from error
     with contextlib.suppress(ValueError, AttributeError, NotImplementedError, OSError):
         port.set_low_latency_mode(True)

@@ -143,7 +143,10 @@ class Reader:
             os.set_blocking(wake_read, False)
             os.set_blocking(self._wake_write, False)
         self._thread = threading.Thread(
-            target=self._run, args=(wake_read,), name="cube reader", daemon=True
+            target=self._run,
+            args=(wake_read,),
+            name="cube reader",
+            daemon=True,
         )
         self._thread.start()
 
@@ -189,7 +192,8 @@ class Reader:
             thread.join(CLOSE_S)
             if thread.is_alive():
                 _log.error(
-                    "the reader did not end within %.1f s: a port hangs in the kernel", CLOSE_S
+                    "the reader did not end within %.1f s: a port hangs in the kernel",
+                    CLOSE_S,
                 )
 
     def _wake(self) -> None:
@@ -226,7 +230,9 @@ class Reader:
         while not self._stopping:
             now = time.monotonic()
             is_late, native, reads = self._intake.read(
-                max(0.0, tick_at - now), self._gather_s, self._expected
+                max(0.0, tick_at - now),
+                self._gather_s,
+                self._expected,
             )
             awake_at = time.monotonic()
             if is_late:

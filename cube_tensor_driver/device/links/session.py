@@ -190,7 +190,11 @@ class Session:
             if frame.result == Result.UNKNOWN and link.hello is not None:
                 actual_us = link.hello.period_us
             self.actual_us = self._answered_us = actual_us
-            link.period_problem = _find_period_problem(self._period_us, actual_us, frame.result)
+            link.period_problem = _find_period_problem(
+                self._period_us,
+                actual_us,
+                frame.result,
+            )
         elif isinstance(frame, Ack) and frame.request == Command.TIME:
             self._knows_time = False
         elif isinstance(frame, Time):

@@ -225,7 +225,13 @@ class CubeTable:
         names: dict[tuple[str, str], list[str]] = {}
         for number, address in enumerate(self._addresses):
             is_claimed = number in claimed
-            found, problem = _locate(address, link, hello, index_of_uid, is_claimed)
+            found, problem = _locate(
+                address,
+                link,
+                hello,
+                index_of_uid,
+                is_claimed,
+            )
             if found is not None:
                 cubes[found] = number
             if problem:

@@ -122,7 +122,12 @@ class Hello:
         return len(self.cube_uids)
 
     def _pack(self) -> bytes:
-        uids = _check_array("cube_uids", self.cube_uids, _U64, (self.n_cubes,))
+        uids = _check_array(
+            "cube_uids",
+            self.cube_uids,
+            _U64,
+            (self.n_cubes,),
+        )
         numbers = _HELLO.pack(
             self.hub_uid,
             self.firmware,
@@ -141,7 +146,12 @@ class Hello:
         if size != _HELLO.size + 8 * n_cubes:
             return None
         first_uid = HEADER.size + _HELLO.size
-        uids: NDArray[np.uint64] = np.frombuffer(raw, _U64, n_cubes, first_uid)
+        uids: NDArray[np.uint64] = np.frombuffer(
+            raw,
+            _U64,
+            n_cubes,
+            first_uid,
+        )
         return cls(hub_uid, firmware, n_pads, period_us, uids, flags)
 
 
@@ -231,9 +241,24 @@ class Sample:
                 f"frequency has {len(self.shape)} dimensions, must have 2: (n_cubes, n_pads)"
             )
         n_cubes, n_pads = self.shape
-        frequency = _check_array("frequency", self.frequency, _U32, (n_cubes, n_pads))
-        pad_fault = _check_array("pad_fault", self.pad_fault, _U32, (n_cubes,))
-        temperature = _check_array("temperature", self.temperature, _I16, (n_cubes,))
+        frequency = _check_array(
+            "frequency",
+            self.frequency,
+            _U32,
+            (n_cubes, n_pads),
+        )
+        pad_fault = _check_array(
+            "pad_fault",
+            self.pad_fault,
+            _U32,
+            (n_cubes,),
+        )
+        temperature = _check_array(
+            "temperature",
+            self.temperature,
+            _I16,
+            (n_cubes,),
+        )
         numbers = _SAMPLE.pack(
             self.sequence,
             self.first_cube,

@@ -162,7 +162,11 @@ class Player:
             is_best_effort=connection.is_best_effort,
         )
         kind = find_message_class(topic, connection.msgtype)
-        self._publishers[topic] = self._node.create_publisher(kind, topic, profile)
+        self._publishers[topic] = self._node.create_publisher(
+            kind,
+            topic,
+            profile,
+        )
         if connection.is_latched:
             self._latched.add(topic)
 
@@ -384,7 +388,9 @@ class ReplayControl:
         )
 
     def _steer(
-        self, request: SteerReplay.Request, answer: SteerReplay.Response
+        self,
+        request: SteerReplay.Request,
+        answer: SteerReplay.Response,
     ) -> SteerReplay.Response:
         try:
             if math.isnan(request.position):

@@ -185,7 +185,11 @@ class _NodeParameters:
 
     def names(self) -> list[str]:
         """Return the sorted names of all parameters of the node."""
-        answer = self._call(ListParameters, "list_parameters", ListParameters.Request())
+        answer = self._call(
+            ListParameters,
+            "list_parameters",
+            ListParameters.Request(),
+        )
         return sorted(answer.result.names)
 
     def check_name(self, parameter: str) -> None:
@@ -225,7 +229,8 @@ class _NodeParameters:
         # rclpy refuses an integer for a parameter of type double, but users write 2 for 2.0.
         if kind is float and value.type == ParameterType.PARAMETER_INTEGER:
             value = ParameterValue(
-                type=ParameterType.PARAMETER_DOUBLE, double_value=float(value.integer_value)
+                type=ParameterType.PARAMETER_DOUBLE,
+                double_value=float(value.integer_value),
             )
         refusal = f"{self._name}: {parameter} is not set to {text}"
         is_known = kind in VALUE_DESCRIPTIONS

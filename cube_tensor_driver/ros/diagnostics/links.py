@@ -31,7 +31,11 @@ class LinkDiagnostics:
         self._skin_name = skin_name
         self._counts_before = RowCounts()
 
-    def make_statuses(self, links: LiveLinks, with_links: bool) -> list[DiagnosticStatus]:
+    def make_statuses(
+        self,
+        links: LiveLinks,
+        with_links: bool,
+    ) -> list[DiagnosticStatus]:
         """Return the diagnostic statuses of the driver.
 
         Args:

@@ -189,7 +189,11 @@ class Canvas:
             longest_pa: Stress, in Pa, whose line is as long as the pitch (distance of neighbouring
                 cubes).
         """
-        lines, is_pull = scene.make_principal_crosses(self._poses, values, self._pitch / longest_pa)
+        lines, is_pull = scene.make_principal_crosses(
+            self._poses,
+            values,
+            self._pitch / longest_pa,
+        )
         shape = make_lines("crosses", lines, LINE_WIDTH * self._pitch)
         colours = np.where(is_pull.reshape(-1, 1), PULL_COLOUR, PUSH_COLOUR)
         return shape._replace(colours=np.repeat(colours, 2, axis=0))
@@ -207,7 +211,11 @@ class Canvas:
         count = 0 if contacts is None else len(contacts.position)
         labels = []
         for number in range(MAX_CONTACTS):
-            label = make_text(f"contact {number}", " ", FORCE_TEXT_HEIGHT * self._pitch)
+            label = make_text(
+                f"contact {number}",
+                " ",
+                FORCE_TEXT_HEIGHT * self._pitch,
+            )
             if contacts is None or number >= count:
                 labels.append(label._replace(opacity=HIDDEN_OPACITY))
                 continue

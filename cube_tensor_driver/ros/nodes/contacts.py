@@ -66,7 +66,13 @@ class Contacts(SkinSubscriberNode):
     def configure(self) -> None:
         self._traction = self.own(self.create_lifecycle_publisher(PointCloud2, "traction", 2))
         self._touch = b""
-        touch = self.create_subscription(SkinTouch, "touch", self._on_touch, NEWEST, raw=True)
+        touch = self.create_subscription(
+            SkinTouch,
+            "touch",
+            self._on_touch,
+            NEWEST,
+            raw=True,
+        )
         self.own(touch)
         self._errors: Array | None = None
         self._errors_s = 0.0

@@ -193,7 +193,11 @@ class FrequenciesPublisher:
         if self._always or self._publisher.get_subscription_count():
             self._publisher.publish(self._next.data())
 
-    def _make_buffer(self, n_rows: int, n_pads: int) -> MessageBuffer[FrequencyRows]:
+    def _make_buffer(
+        self,
+        n_rows: int,
+        n_pads: int,
+    ) -> MessageBuffer[FrequencyRows]:
         return frequency_codec.buffer(self._frame_id, n_rows, n_pads)
 
 

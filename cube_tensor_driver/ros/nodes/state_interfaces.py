@@ -159,7 +159,11 @@ def make_state_interfaces(node: CubeNode, skin: Skin) -> StateInterfaces | None:
     # SILENT_S). Rows are sent only once per publish period, so this period is added.
     silent_s = max(SILENT_S, 3 / (skin.rate or DEFAULT_RATE_HZ))
     stale_s = silent_s + node.read_value("publish_period")
-    wrenches = SkinWrenches(skin, node.read_value("wrench_side") or None, stale_s)
+    wrenches = SkinWrenches(
+        skin,
+        node.read_value("wrench_side") or None,
+        stale_s,
+    )
     return StateInterfaces(node, skin, component, wrenches)
 
 
@@ -194,7 +198,8 @@ class StateInterfaces:
         topic = component.lower().replace("/", "_")
         kinds = [
             find_message_class(
-                "parameter hardware_name", f"pal_statistics_msgs/msg/Statistics{what}"
+                "parameter hardware_name",
+                f"pal_statistics_msgs/msg/Statistics{what}",
             )
             for what in ("Names", "Values")
         ]

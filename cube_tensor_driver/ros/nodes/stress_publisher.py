@@ -373,5 +373,9 @@ class _CubePublishers:
     def _announce(self, topics: set[str]) -> None:
         for topic in sorted(topics):
             cube = self._unannounced.pop(topic)
-            publisher = self._node.create_publisher(self._message_type, topic, CUBE_TOPIC_DEPTH)
+            publisher = self._node.create_publisher(
+                self._message_type,
+                topic,
+                CUBE_TOPIC_DEPTH,
+            )
             self._publishers[cube] = self._node.own(publisher)

@@ -64,7 +64,11 @@ class TouchPublisher:
         self._reconstructor = reconstructor
         self._worker = ThreadPoolExecutor(1)
         self._future: Future[Touch] | None = None
-        self._make_message = partial(make_touch_message, make_message, skin.parent_frame)
+        self._make_message = partial(
+            make_touch_message,
+            make_message,
+            skin.parent_frame,
+        )
         self._publisher = node.own(node.create_lifecycle_publisher(SkinTouch, "touch", profile))
         self._rest_changes = 0
 
@@ -76,7 +80,11 @@ class TouchPublisher:
         # Most messages contain no touch and differ only in their stamps, so such a message is
         # serialised once, and later only its stamp is replaced.
         self._empty = bytearray(serialize_message(self._make_message(NO_TOUCHES)))
-        return Touch(self._skin, self._false_alarms, self._reconstructor.errors)
+        return Touch(
+            self._skin,
+            self._false_alarms,
+            self._reconstructor.errors,
+        )
 
     def publish(self, rows: StressRows, rest_changes: int) -> None:
         """Find and publish the touches of one or several scans.

@@ -443,7 +443,13 @@ class MujocoSkin:
             if not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
                 distance = -1.0  # it does not collide
             elif kind == mujoco.mjtGeom.mjGEOM_MESH:
-                distance = mujoco.mj_rayMesh(model, reference, geom, place, outward)
+                distance = mujoco.mj_rayMesh(
+                    model,
+                    reference,
+                    geom,
+                    place,
+                    outward,
+                )
             else:
                 distance = mujoco.mju_rayGeom(
                     reference.geom_xpos[geom],

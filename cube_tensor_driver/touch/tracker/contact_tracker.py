@@ -388,7 +388,12 @@ class ContactTracker:
             if region.fit is None:
                 is_own = (owner[points] == number) | (owner[points] < 0)
                 own = points[is_own]
-                region.integral = self._integrate(region, own, inverse.area / claims[own], field)
+                region.integral = self._integrate(
+                    region,
+                    own,
+                    inverse.area / claims[own],
+                    field,
+                )
 
     def _integrate(
         self,

@@ -53,7 +53,11 @@ def add_fits(
     variance = np.zeros((2, n))
     for fit in fits:
         contacts = fit.to_contacts(inverse.spacing)
-        points, share, below, rotation = _distribute(inverse, fit.values, contacts)
+        points, share, below, rotation = _distribute(
+            inverse,
+            fit.values,
+            contacts,
+        )
         point_forces = contacts.forces @ share.T
         traction[points] += np.einsum("mab,bm->ma", rotation, point_forces) / inverse.area
         pressure[points] += below @ contacts.forces.ravel()

@@ -365,7 +365,11 @@ class HertzFit:
         log_sizes = (base.log_sizes + change[:, 5]).clip(*self._log_range)
         change[:, 5] = log_sizes - base.log_sizes
         self._change = change
-        self.found = Discs(base.forces + change[:, :3], base.centres + change[:, 3:5], log_sizes)
+        self.found = Discs(
+            base.forces + change[:, :3],
+            base.centres + change[:, 3:5],
+            log_sizes,
+        )
 
     def to_contacts(self, step: float) -> ContactSum:
         """Describe the contacts, with flatness, moment and covariance, as a sum of Hertz contacts.
@@ -422,7 +426,12 @@ class HertzFit:
         n_contacts = len(self.found.forces)
         n_parameters = n_contacts * _N_PARAMETERS
         covariance = self.inflation * self.linear.covariance[:n_parameters, :n_parameters]
-        blocks = covariance.reshape(n_contacts, _N_PARAMETERS, n_contacts, _N_PARAMETERS)
+        blocks = covariance.reshape(
+            n_contacts,
+            _N_PARAMETERS,
+            n_contacts,
+            _N_PARAMETERS,
+        )
         contact = np.arange(n_contacts)
         return np.asarray(blocks[contact, :, contact])
 
@@ -430,7 +439,10 @@ class HertzFit:
         """Return force, position, moment and area of each contact."""
         estimates = []
         for discs, change, covariance in zip(
-            zip(*self.found, strict=True), self._change, self._covariances, strict=True
+            zip(*self.found, strict=True),
+            self._change,
+            self._covariances,
+            strict=True,
         ):
             force, centre, log_size = discs
             variances = np.diag(covariance)

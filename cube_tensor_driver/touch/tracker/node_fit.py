@@ -196,13 +196,21 @@ class NodeFit:
         around = np.flatnonzero(is_around)
         region_points = unroll_points(inverse, values.home, points)
         points_around = unroll_points(inverse, values.home, around)
-        self.places, self.spacing = _place_nodes(region_points, points_around, inverse)
+        self.places, self.spacing = _place_nodes(
+            region_points,
+            points_around,
+            inverse,
+        )
         self.size = _NODE_RADIUS * inverse.depth
         self._peak_width = _PEAK_WIDTH * inverse.depth
 
         # The force of a node is its pressure times the square of the spacing, so covariances of
         # forces contain the fourth power of the spacing.
-        self._squared_distances = cdist(self.places, self.places, "sqeuclidean")
+        self._squared_distances = cdist(
+            self.places,
+            self.places,
+            "sqeuclidean",
+        )
         lengths = _CORRELATION_LENGTHS[:, None, None] * inverse.depth
         exponents = self._squared_distances / (2 * lengths**2)
         correlations = np.exp(-exponents)
@@ -241,7 +249,11 @@ class NodeFit:
         Args:
             white: Whitened values (n C,), as for `solve`.
         """
-        sensitivity = self.values.sensitivity(self.places, self.size, self.forces)
+        sensitivity = self.values.sensitivity(
+            self.places,
+            self.size,
+            self.forces,
+        )
         self._set_sensitivity(sensitivity)
         self._condition(white)
         self._separate_contacts()
@@ -310,7 +322,12 @@ class NodeFit:
         radius = _NODE_RADIUS / NODE_STEP * self.spacing
         for centre, polynomials, unit_root in self._contacts:
             root = np.sqrt(self.misfit) * unit_root
-            estimate = estimate_contact(centre, self.forces @ polynomials, root, radius)
+            estimate = estimate_contact(
+                centre,
+                self.forces @ polynomials,
+                root,
+                radius,
+            )
             self._estimates.append(estimate)
         return self._estimates
 
@@ -428,7 +445,11 @@ class NodeFit:
         # Diagonal neighbours on the grid are 1.41 spacings apart.
         reach = 1.5 * self.spacing
         is_neighbour = self._squared_distances < reach**2
-        labels = split_peaks(-smoothing @ self.forces[2], smoothing @ normal_root, is_neighbour)
+        labels = split_peaks(
+            -smoothing @ self.forces[2],
+            smoothing @ normal_root,
+            is_neighbour,
+        )
         self._estimates = []
         # Each contact is described by its centre, the polynomials of its nodes, and a square root
         # of the covariance of its moments.

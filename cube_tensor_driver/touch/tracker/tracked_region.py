@@ -191,7 +191,12 @@ class TrackedRegion:
         waited: Number of scans (sets of values of all cubes) since the fit was last improved.
     """
 
-    def __init__(self, inverse: SurfaceInverse, noise: CubeNoise, respond: Respond) -> None:
+    def __init__(
+        self,
+        inverse: SurfaceInverse,
+        noise: CubeNoise,
+        respond: Respond,
+    ) -> None:
         self.points: Index = np.zeros(0, np.intp)
         self.cubes: Index = np.zeros(0, np.intp)
         self.peak = 0.0
@@ -681,6 +686,10 @@ def _update_stale_responses(
     first = 0
     for region, cubes in stale:
         end = first + len(region.discs[1].forces) * len(cubes)
-        by_disc = measured[first:end].reshape(-1, len(cubes), measured.shape[1])
+        by_disc = measured[first:end].reshape(
+            -1,
+            len(cubes),
+            measured.shape[1],
+        )
         region.take_response(cubes, by_disc.sum(axis=0))
         first = end

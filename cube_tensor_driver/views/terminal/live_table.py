@@ -216,8 +216,16 @@ class LiveTable:
                 size, unit = find_component_unit(name)
                 stress, _, axis = name.partition("_")
                 label = f"∂{stress}/∂{axis}" if axis else stress
-                columns[f"{label}\n{unit}"] = _format_numbers(values / size, shown, "+7.2f")
-        columns["residual"] = _format_numbers(self._latest.residual, shown, ".2f")
+                columns[f"{label}\n{unit}"] = _format_numbers(
+                    values / size,
+                    shown,
+                    "+7.2f",
+                )
+        columns["residual"] = _format_numbers(
+            self._latest.residual,
+            shown,
+            ".2f",
+        )
         columns["Hz"] = _format_numbers(self._rate, shown, "4.0f")
         columns["state"] = [self._state(cube) for cube in shown]
         return columns
