@@ -13,8 +13,9 @@ import numpy as np
 from ..core.arrays import AnyArray, Index, Mask, Times
 
 BLOCK_BYTES = 1 << 18
-"""Minimum total size, in bytes, of the messages that are joined to one block. Messages in a chunk
-of an MCAP file lie in one block already, and are not joined."""
+"""Minimum total size, in bytes, of single messages that are joined to one block (`StoredMessages`
+with common bytes), so that numpy handles many messages at once. Messages in a chunk of an MCAP file
+have common bytes already, and are not joined."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +101,9 @@ def join(messages: Sequence[tuple[int, int, bytes]]) -> StoredMessages:
 
 
 def join_in_blocks(messages: Iterable[tuple[int, int, bytes]]) -> Iterator[StoredMessages]:
-    """Join single messages to blocks of at least `BLOCK_BYTES`; the last one may be smaller.
+    """Join single messages to blocks (`StoredMessages` with common bytes).
+
+    Blocks have at least `BLOCK_BYTES`; the last one may be smaller.
 
     Args:
         messages: Channel, time of recording in ns, and serialised bytes of each message.

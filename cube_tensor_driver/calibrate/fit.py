@@ -594,8 +594,9 @@ def _advise(
                 "give them as fixed, or choose a larger symmetry"
             )
             break
-        # The advice names the coefficients that the best load determines. If it determines some
-        # only together with the next load, the advice names all undetermined ones.
+        # The sentence for this load names the coefficients that become determined if the load is
+        # added. If none does before a load of a later sentence is added, too, it names all that are
+        # still undetermined.
         settled = names[is_open & ~new_open]
         subject = settled if len(settled) else names[is_open]
         name = model.structure.modes.names[mode]

@@ -166,7 +166,8 @@ class LiveLinks:
         self._errors = 0
         # Monotonic time, in s, until which scans are dropped because the host is too slow.
         self._overloaded_until = 0.0
-        # Number of samples lost until the last callback; None while this process reads in time.
+        # Number of lost samples at the last call of `_is_overloaded`. If it grows while this
+        # process reads late, the host is too slow. None if the process read in time at that call.
         self._missing_before: int | None = None
         self._reader = self._make_reader()
 

@@ -180,7 +180,9 @@ def plan_bag(path: Path, choices: Choices) -> BagPlan:
                     f"{path}: a sample is stamped {seconds:.0f} s after the first of its episode, "
                     "which is longer than was recorded: a clock was set; leave it out with --marks"
                 )
-            # Interval 0 lies before the first episode, and one interval follows each episode.
+            # Interval 0 is the time before the first episode. Each episode adds one interval per
+            # frame, and one for the time from its last frame to the next episode. Each interval
+            # but the first has one edge, its begin. So after n edges, interval n + 1 is the next.
             first = len(edges_ns) + 1
             episodes.append(
                 Episode(

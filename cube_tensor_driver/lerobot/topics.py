@@ -100,11 +100,12 @@ class Signal:
     """The numbers in all messages on a topic of one bag."""
 
     def __init__(self, bag: Bag, topic: Topic) -> None:
-        """Read the numbers.
+        """Read the numbers, such as joint positions, from all messages on the topic.
 
         Args:
             bag: Open bag.
-            topic: The topic. Its `names` are those of the numbers in all bags of the data set.
+            topic: The topic. Its `names` must contain the numbers of every bag of the data set (see
+                `Topic.describe`), because each name becomes a column for every bag.
 
         Raises:
             BagError: The bag is damaged, or a JointState has more or fewer values than joint names.

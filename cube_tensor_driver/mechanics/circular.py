@@ -94,13 +94,16 @@ the component by exp(-i m angle)."""
 
 _PARTS_FROM_FIELD = np.concatenate([CIRCULAR_FROM_FIELD.real, CIRCULAR_FROM_FIELD.imag])
 """Matrix (28, 24) from the stresses and gradients `FIELD` to the real and then the imaginary parts
-of the circular components."""
+of the circular components, combinations whose phase alone changes if the frame is rotated about z.
+"""
 
 FIELD_FROM_CIRCULAR = np.linalg.pinv(_PARTS_FROM_FIELD).T
 """Matrix (28, 24) from the real and then the imaginary parts of the circular components back to the
 stresses and gradients `FIELD`.
 
-The parts are a row vector on the left of the matrix: ``field = parts @ FIELD_FROM_CIRCULAR``.
+A circular component is a complex combination of stresses and gradients whose phase alone changes
+if the frame is rotated about z, for example zx + i yz. The parts are a row vector on the left of
+the matrix: ``field = parts @ FIELD_FROM_CIRCULAR``.
 """
 
 

@@ -315,15 +315,21 @@ def _compute_airy(
         n1: Array,
         n2: Array,
     ) -> tuple[Array, Complex]:
-        """Return trace T and deviator D of the second derivatives of g, or their derivatives by Z.
+        """Return trace T and deviator D of the second derivatives of the Airy function g.
+
+        They determine the in-plane stress. T and D contain the potential chi = Z ln(R + Z) - R in
+        the terms of tangential forces and chi_Z = dchi/dZ in those of normal forces, where R is the
+        distance from the force and Z the depth below it. If each potential is replaced by its
+        derivative by Z, the results are the derivatives of T and D by Z.
+
+        In a plane Z = const, a potential h depends on the distance r from the normal through the
+        force. The arguments are h1 = (dh/dr) / r, h2 = (dh1/dr) / r and h3 = (dh2/dr) / r.
 
         Args:
-            t2: Function h2 in the terms of tangential forces: that of h = chi, or that of
-                h = chi_Z for the derivatives by Z.
-            t3: Function h3 of the same h.
-            n1: Function h1 in the terms of normal forces: that of h = chi_Z, or that of h = chi_ZZ
-                for the derivatives by Z.
-            n2: Function h2 of the same h.
+            t2: h2 of the potential for tangential forces.
+            t3: h3 of the potential for tangential forces.
+            n1: h1 of the potential for normal forces.
+            n2: h2 of the potential for normal forces.
         """
         trace = f_dot_d * (4 * t2 + r_square * t3) - fz * (2 * n1 + r_square * n2)
         deviator = 2 * force * position * t2 + position**2 * (f_dot_d * t3 - fz * n2)

@@ -151,10 +151,12 @@ class ContactResponse:
         distance = np.maximum(true_distance, _MIN_DISTANCE * self._depth)
         parts = self._interpolate_slopes(distance, size)
 
-        # A force F_r towards the cube, F_t across and F_z along z causes the circular components of
-        # stress and gradient c = exp(i m phi) (R F_r + Z F_z + i T F_t), where R, Z and T depend on
-        # the distance (circular.py). `loads` are c / exp(i m phi), its derivative by the distance,
-        # and its first and second derivative by the natural logarithm of the radius.
+        # A circular component c of order m (circular.py) is a combination of the stresses and
+        # gradients at a cube that a rotation of the frame about z multiplies by a phase. Let phi be
+        # the direction from the contact to the cube. A force F_r along it, F_t across it and F_z
+        # along z causes c = exp(i m phi) (R F_r + Z F_z + i T F_t), where R, Z and T depend on the
+        # distance. `loads` has four parts: c / exp(i m phi) under `force`, its derivative by the
+        # distance, and its first and second derivative by the natural logarithm of the radius.
         cosine = np.cos(direction).astype(np.float32)[:, None]
         sine = np.sin(direction).astype(np.float32)[:, None]
         force = force[..., None].astype(np.float32)

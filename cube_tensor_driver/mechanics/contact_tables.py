@@ -123,11 +123,14 @@ class _ContactTables:
         self._rows = table.reshape(-1, width).view(np.float32)
 
     def _compute(self) -> Arrays:
-        """Compute the table of circular components under unit loads; subclasses implement it.
+        """Compute the table of the stress and gradient at a cube under unit loads on the surface.
+
+        Subclasses implement it. The table contains circular components: complex combinations of
+        stresses and gradients whose phase alone changes if the frame is rotated about z.
 
         Returns:
-            Dictionary with the single key `table`: 14 complex circular components (grid points ...,
-            unit loads, 14) for each grid point and each unit load.
+            Dictionary with the single key `table`: 14 circular components (grid points ..., unit
+            loads, 14) for each grid point and each unit load.
         """
         raise NotImplementedError
 

@@ -68,7 +68,10 @@ class TractionPrior:
     """
 
     def __init__(self, cubes: CubeMeasurement) -> None:
-        """Compute the tables of the covariances, or load them from the cache.
+        """Compute the tables of the prior covariances, or load them from the cache.
+
+        They are covariances of the components that cubes measure, with each other and with the
+        traction on the surface.
 
         Args:
             cubes: Layer, depth and measurement model of the cubes.

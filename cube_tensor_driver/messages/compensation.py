@@ -25,7 +25,9 @@ STATES = ("creep", "thermal")
 
 
 NO_STATE = np.zeros(0)
-"""State of an effect that is not compensated, or not recorded in a message."""
+"""Empty array in place of the state of an effect (creep or temperature), if the effect is not
+compensated or the message does not contain the state. With the state, which sums up all earlier
+rows, reprocessing can continue the compensation in the middle of a recording."""
 
 
 def encode_compensation(
@@ -85,7 +87,7 @@ def read_motion(message: SkinCompensation, stamp_ns: int) -> Motion | None:
 
 
 def read_states(message: SkinCompensation) -> dict[str, Array]:
-    """Return the states of effects in a SkinCompensation message, by their names in `STATES`.
+    """Return the states of creep and temperature in a SkinCompensation, by their names in `STATES`.
 
     States that are empty in the message are left out.
     """

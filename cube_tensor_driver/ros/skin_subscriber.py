@@ -168,9 +168,9 @@ class SkinSubscriberNode(CubeNode):
     def compute_message(self, skin: FollowedSkin, health: Index) -> object:
         """Return the message to publish now, or its serialised bytes; subclasses override it.
 
-        It is called by a timer `rate` times per second. If `follow_stress` is overridden, it is
-        called when stress arrives instead, at most that often. If it returns None, nothing is
-        published.
+        A timer calls it `rate` times per second. If the subclass overrides `follow_stress`, too,
+        there is no timer: it is called when a `stress` message arrives, but on average at most
+        `rate` times per second. If it returns None, nothing is published.
 
         Args:
             skin: The state of the skin.

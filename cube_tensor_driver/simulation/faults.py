@@ -42,8 +42,11 @@ KINDS = {
     "pads": "send one pad too many for `seconds`",
     "version": "speak protocol version 2 for `seconds`",
 }
-"""Effect of each kind of fault of simulated hubs, as a text for the user. Words in backquotes are
-the attributes of `Fault` that the kind uses."""
+"""Effect of each kind of fault of simulated hubs, as a text for the user.
+
+Words in backquotes are the attributes of `Fault` that the kind uses. For "noisy", `value` is the
+standard deviation of the noise divided by the frequency of the pad, and 1e-3 is its default.
+"""
 
 MAX_COUNT = (1 << 32) - 1
 """Maximum value of the whole numbers of a fault: number of affected samples, index of a cube, index

@@ -46,9 +46,10 @@ the status bit COMPENSATION. The bit says that the compensation of weight, creep
 uncertain; the limit applies if `ContactFinder.update` is not told how large its errors are.
 
 The compensated values of nine unloaded cubes 24 mm apart gave a pressure of up to 402 Pa when the
-ground warmed by 15 K within a minute. With a tare before, it was up to 860 Pa: the tare removes the
-error of the fit at rest, which cancels a part of the error while the ground warms. With smaller
-distances, the pressures were lower.
+ground warmed by 15 K within a minute. If the skin had been tared before, it was up to 860 Pa. A
+tare removes the error that the fitted calibration has at rest, and without a tare this error
+cancels a part of the error that the warming causes. With smaller distances, the pressures were
+lower.
 """
 
 CERTAIN_DEVIATIONS = 2.5

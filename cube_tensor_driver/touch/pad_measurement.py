@@ -41,12 +41,15 @@ from ..mechanics.spectra import BesselTable, Spectra, make_wavenumber_quadrature
 
 N_DIRECTIONS = 32
 """Number of equally spaced directions from the force to the cube at which the influence functions
-are evaluated for their Fourier series."""
+(stress on each pad under a force of 1 N) are evaluated for their Fourier series."""
 
 N_ORDERS = 9
-"""Number of orders m of the Fourier series over the direction, 0 to 8. The stress and its gradients
-at a point under a point force have orders up to 4; the four-fold symmetry of a cube adds up to
-4."""
+"""Number of orders m, 0 to 8, of the Fourier series of the influence functions (stress on each pad
+under a force of 1 N) over the direction from the force to the cube.
+
+The stress and its gradients at a point under a point force have orders up to 4; the four-fold
+symmetry of a cube adds up to 4.
+"""
 
 MIN_SINGULAR_VALUE = 1e-3
 """Smallest singular value, divided by the largest one, of a circular component that is kept.
@@ -61,8 +64,9 @@ _N_DISTANCES = 400
 of the Bessel functions up to the largest distance (half the width of the finite element body)."""
 
 _PADS = "pads"
-"""Name, in the cached file, of the matrix from circular components to the stresses of the pads. The
-other arrays of the file are the attributes of `Spectra`."""
+"""Name, in the cached file, of the matrix from circular components to the stresses of the pads. A
+rotation about the normal of the skin multiplies a circular component by a phase. The other arrays
+of the file are the attributes of `Spectra`."""
 
 _MATCH_TOLERANCE = 1e-6
 """Largest difference up to which the cube and pads of a calibration count as those of the influence

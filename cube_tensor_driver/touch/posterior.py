@@ -60,8 +60,12 @@ ROWS_PER_POINT = 4
 point at the depth of the cubes' centres."""
 
 _POSE_TOLERANCE = 1e-5
-"""Rounding step of the poses of cubes in their windows: in m for positions, without a unit for the
-sines and cosines of angles. Windows with equal rounded poses share their matrices."""
+"""Rounding step of the poses of the cubes in a window (nearest cubes from which the traction around
+a cube is computed): in m for positions, without a unit for the sines and cosines of angles.
+
+Windows with equal rounded poses, noise and calibrations share the matrices by which the traction
+follows from the values of the cubes.
+"""
 
 
 class ObservationModel(NamedTuple):
@@ -447,9 +451,11 @@ def _compute_cross_covariance(
     angle: Array,
     points: Array,
 ) -> Array:
-    """Compute the prior covariance K_ty of the results at all points with the values of W cubes.
+    """Compute the prior covariance K_ty of the traction at surface points with the cubes' values.
 
-    Positions and rotations are in the frame of the centre cube, around which the skin is laid flat.
+    At each point, the traction along x, y and z is followed by the pressure below the point at the
+    depth of the cubes' centres. Each cube has C values, the observed components. Positions and
+    rotations are in the frame of the centre cube, around which the skin is laid flat.
 
     Args:
         traction_prior: Prior covariances of traction and measured components.

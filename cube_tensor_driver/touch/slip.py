@@ -235,16 +235,8 @@ class SlipEstimator:
         count = min(N_CUBES, len(self._above_cubes))
         n_values = count * len(inverse.columns)
         n_scans = LAGS[-1] + 1
-        # These are the fields of a contact. A load consists of force (3) in N and position (3) in
-        # m. `load` is the load at the cubes' values `values` (Pa), and `weights` is the matrix from
-        # changes of these values to changes of the load. `linearised` is the load for which this
-        # matrix was computed, and `noise` the standard deviation of the position, in m. `sums` are
-        # those of `_add_ratio`. `past` has the motion states (`_compute_motion_states`) of the last
-        # scans, newest first. The remaining fields belong to the fit of `Slip.partial`, which is
-        # stored in `partial`. `first` are cubes, weights and values in the first scan of the fit,
-        # and `terms` are the terms of the fit in the newest scan. `gram` and `moments` are sums
-        # over all scans of the fit: products of the terms with each other, and of the terms with
-        # the changes of the values.
+        # The following are the fields of one contact. A load is force (3) in N and position (3) in
+        # m. The matrix `weights` converts changes of the cubes' values, in Pa, to changes of it.
         linear: list[tuple[str, type, tuple[int, ...]]] = [
             ("cubes", int, (count,)),
             ("weights", float, (6, n_values)),
@@ -258,15 +250,25 @@ class SlipEstimator:
             ("largest_ratio", float, ()),
             ("slips", bool, ()),
             ("is_fitted", bool, ()),
+            # Sums over the scans in which the contact slipped, for the weighted mean of the ratios
+            # of shear and normal force, which is the friction coefficient (`_add_ratio`).
             ("sums", float, (3,)),
             *linear,
+            # Standard deviation of the position, in m.
             ("noise", float, ()),
+            # Load at `values`, and load for which `weights` was computed.
             ("load", float, (6,)),
             ("linearised", float, (6,)),
+            # Motion states (`_compute_motion_states`) in the last scans, newest first.
             ("past", float, (n_scans, 7)),
+            # Least-squares fit of the cubes' values that shows partial slip (head of this file):
+            # cubes, weights and values in its first scan, its result `Slip.partial`, and its terms
+            # in the newest scan (1, n, q and |q| q).
             ("first", linear, ()),
             ("partial", float, ()),
             ("terms", float, (8,)),
+            # Normal equations of this fit, summed over its scans: products of the terms with each
+            # other, and of the terms with the changes of the values.
             ("gram", float, (8, 8)),
             ("moments", float, (8, n_values)),
         ]

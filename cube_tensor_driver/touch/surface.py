@@ -190,12 +190,15 @@ class Surface:
 
         The elastomer above the plane of the cubes' centres is in equilibrium. So the integral of
         the pressure in this plane is the normal force on the surface. The first moment of the
-        pressure in this plane is the first moment of the load on the surface plus depth × shear
-        force; this product is subtracted to get the position of the contact. For this
-        moment, pressure and shear are interpolated by the same method, from values without
-        gradients. Below a point force on an incompressible body, the vector (σzx, σyz, σzz) points
-        away from the force, so that each single cube gives the correct position, and so does every
-        weighted mean over cubes.
+        pressure (integral of position × pressure) in this plane is that of the load on the surface
+        plus depth × shear force. This product is subtracted, and the difference divided by the
+        normal force is the position of the contact.
+
+        To compute the position, pressure and shear are interpolated with the same weights of the
+        cubes, so the gradients of the pressure are not used. Below a point force on an
+        incompressible body, the vector (σzx, σyz, σzz) at a cube points away from the force. So
+        each single cube gives the correct position, and a sum over cubes also does if pressure and
+        shear have the same weights.
 
         The stress that spreads beyond the edge of the skin is not measured. The pressure loses
         little by this, the shear force a fraction of about 1.5 times the ratio of the depth to the

@@ -61,7 +61,8 @@ class Thermal:
         """Start without any row.
 
         Args:
-            pipeline: Pipeline with the calibrations and the pads' stiffness.
+            pipeline: Pipeline with the calibrations, which contain the models of temperature, and
+                the stiffness of the pads, by which the thermal stress is divided (see `offset`).
         """
         models = [calibration.thermal for calibration in pipeline.calibrations]
         self.has_model = np.array([model is not None for model in models])
@@ -140,12 +141,16 @@ class Thermal:
         self._update()
 
     def _filter(self, elapsed_s: Real, before: Array, now: Array) -> Array:
-        """Advance the filters by intervals (C,), in s, and return the fractions of `LowPass`.
+        """Advance the low-pass filters, which give the elastomer's temperature, by one interval.
 
         Args:
             elapsed_s: Lengths of the intervals (C,), in s.
             before: Measured temperatures at the begin of the intervals (C,), in °C.
             now: Measured temperatures at their end (C,), in °C.
+
+        Returns:
+            Fraction 1 - exp(-elapsed_s / lag) of the output of each filter of each cube (filters,
+            C) that the interval replaced.
         """
         # An unknown temperature does not change, so any number may stand for it.
         first, last = inputs = np.array([before, now])[..., None]

@@ -132,7 +132,15 @@ def compute_temperature_factor(
 
 
 def find_existing(tables: Tables, calibration: Numbers) -> Mask:
-    """Return a mask (N, P) of the pads that cubes with N calibrations have."""
+    """Return a mask of the pads that N cubes have; a cube may have fewer pads than others.
+
+    Args:
+        tables: Tables of the skin.
+        calibration: Number of the calibration of each cube (N,).
+
+    Returns:
+        Mask (N, P), where P is the largest number of pads of a cube of the skin.
+    """
     pads = np.arange(tables.rest.shape[1])
     return pads < tables.pads[calibration][:, None]
 

@@ -104,7 +104,8 @@ class HubClock:
         return track.first_ns - 1000 * track.first_us + round(since_origins)
 
     def reset(self) -> None:
-        """Discard the line and its points, because the hub restarted; keep the drift."""
+        """Discard the clock line (host time over device time) and its points, because the hub
+        restarted; keep the drift."""
         self._count_step()
         self._restart()
 
@@ -179,7 +180,8 @@ class HubClock:
         return stamps + self._convert(times[start:], arrival_ns, is_late)
 
     def _restart(self) -> None:
-        """Discard the line and all samples; keep the drift and the last stamp."""
+        """Discard the clock line (host time over device time) and all samples; keep the drift and
+        the last stamp."""
         self.track.newest_ns = NEVER
         self.track.reference = -1
         self.track.period_us = 0.0
@@ -248,14 +250,18 @@ class HubClock:
         if is_low != (step_ns > 0):
             self.track.period_us = 0.0  # The hub sampled late, maybe with another period.
             return
-        # The origin of device times moves with the clock, so that the line stays valid.
+        # `first_us`, from which device times are counted, moves with the clock, so that the clock
+        # line (host time over device time) stays valid. After a step forward, the newest device
+        # time includes the step, which is subtracted. After a step back, it may be from before the
+        # step, so it is kept.
         self.track.first_us += step_ns // 1000
         self.track.newest_ns -= max(0, step_ns)
         self._doubtful_stamp = self.track.last_stamp_ns
         self._count_step(CLOCK_SET)
 
     def _learn(self, newest_us: int, arrival_ns: int, is_late: bool) -> bool:
-        """Fit the line to the newest of some samples, and return whether the line can be used.
+        """Fit the clock line (host time over device time) to the newest of some samples, and return
+        whether it can be used.
 
         Args:
             newest_us: Largest device time of the samples, in µs.

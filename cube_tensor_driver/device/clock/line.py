@@ -32,25 +32,29 @@ MIN_BUCKETS_FOR_DRIFT = 5
 """Smallest number of points, one for each bucket of 1 s, from which the drift of the hub's clock is
 estimated. Within fewer seconds, a change of the delay would look like drift."""
 UNKNOWN_DRIFT = 1e-4
-"""Largest assumed error of the drift (relative deviation of the clocks' rates) if the line has at
-most one point: quartz crystals deviate by less than 100 ppm. With n points, the assumed error is n
-times smaller."""
+"""Assumed error of the drift (relative deviation of the clocks' rates) while the clock line (host
+time over device time) has at most one point. Quartz crystals deviate by less than 100 ppm.
+
+With n points, one per second, the assumed error is n times smaller: the longer the line, the better
+its slope is known.
+"""
 MAX_DRIFT = 1e-3
 """Largest credible drift, to which the fitted drift is limited. A larger one is found when the host
 pauses and reads many samples late."""
 MAX_RISE_NS = 20e6
-"""Largest credible rise, in ns, of the smallest delay in a bucket (1 s) above the clock line; USB
-adapters delay samples by up to 16 ms. If the rises of two successive buckets are larger, a clock
-was set; a single larger one may come from a pause of the host."""
+"""Largest credible rise, in ns, of the smallest delay in a bucket (1 s) above the clock line (host
+time over device time). USB adapters delay samples by up to 16 ms. If the rises of two successive
+buckets are larger, a clock was set; a single larger one may come from a pause of the host."""
 MAX_FALL_NS = 4e6
-"""Largest credible fall, in ns, of the smallest delay in a bucket (1 s) below the clock line. A
-larger fall means that a clock was set. Steps of 5 ms shall be found."""
+"""Largest credible fall, in ns, of the smallest delay in a bucket (1 s) below the clock line (host
+time over device time). A larger fall means that a clock was set. Steps of 5 ms shall be found."""
 MAX_DELAY_NS = 60_000_000_000
-"""Longest credible delay between sampling and arrival, in ns. If the line gives a longer one, the
-arrival time is used as the stamp."""
+"""Longest credible delay between sampling and arrival, in ns. If the clock line (host time over
+device time) gives a longer one, the arrival time is used as the stamp."""
 JITTER_POINTS = 64
 """Time constant, in reads of the link, of the low-pass filter that estimates the jitter: the mean
-delay of the samples beyond the smallest delay, which is their height above the clock line."""
+delay of the samples beyond the smallest delay, which is their height above the clock line (host
+time over device time)."""
 
 
 class ClockLine:

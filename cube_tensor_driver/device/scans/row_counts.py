@@ -68,7 +68,10 @@ class RowCounts:
         return lost
 
     def check(self, n_waiting: int) -> None:
-        """Update `unaccounted`, the number of received rows that have gone missing.
+        """Check that every received row is counted once, by what has happened to it.
+
+        `unaccounted` becomes the number of received rows that were not delivered, left out or lost,
+        and do not wait for the rest of their scan. It is 0 unless the driver has a defect.
 
         Args:
             n_waiting: Number of rows that wait for the rest of their scan.

@@ -44,9 +44,12 @@ HEADER = struct.Struct("<BBH")
 OVERHEAD = HEADER.size + 4
 """Number of bytes of a frame besides its payload: header and CRC-32 (checksum, 4 bytes)."""
 _HELLO = struct.Struct("<QIHBBI")
-"""Numbers at the start of the payload of HELLO, before those of its cubes."""
+"""Layout of the start of the payload of HELLO: uid of the hub, firmware version, number of cubes,
+number of pads per cube, flags, and sample period in µs. The uids of the cubes follow."""
 _SAMPLE = struct.Struct("<IHHQB3x")
-"""Numbers at the start of the payload of SAMPLE, before those of its cubes."""
+"""Layout of the start of the payload of SAMPLE: number of the sample, index of the first cube,
+number of cubes, device time in µs, number of pads per cube, and 3 unused bytes. The arrays with
+the measurements of the cubes follow."""
 _FREQUENCY = HEADER.size + _SAMPLE.size
 """Byte offset of the frequencies from the start of a decoded SAMPLE frame."""
 _U32 = np.dtype("<u4")

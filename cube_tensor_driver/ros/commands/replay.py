@@ -44,8 +44,8 @@ found its other topics yet and would miss their first messages.
 """
 
 MAX_WAIT_S = 3.0
-"""Time, in seconds, without a new subscriber after which the replay begins even if the topic
-`frequencies` has no subscriber, because no reconstruction node runs."""
+"""Time, in seconds, without a new subscriber after which the replay begins although the topic
+`frequencies` has no subscriber. The topic stays without one if no reconstruction node runs."""
 
 LOOK_PERIOD_S = 0.1
 """Time, in seconds, between two counts of the subscribers of the replayed topics, while the replay

@@ -372,11 +372,14 @@ class HertzFit:
         )
 
     def to_contacts(self, step: float) -> ContactSum:
-        """Describe the contacts, with flatness, moment and covariance, as a sum of Hertz contacts.
+        """Describe the contacts as a sum of Hertz contacts, with the covariance of their forces.
 
-        Each contact becomes seven: itself, one shifted each way along x and along y, one wider and
-        one narrower. Differences between them approximate the derivatives of its traction by
-        centre, size, flatness and moment.
+        The fitted contacts are not pure Hertz contacts: flatness moves their pressure to the rim
+        (`FLATNESS_STEP`), and a moment about z acts on them. So each one becomes seven Hertz
+        contacts: itself, one shifted each way along x and along y, one wider and one narrower. A
+        difference of two of them approximates a derivative of its traction, for example by the
+        centre. So a change of any parameter means changes of the seven forces, and the covariance
+        of the parameters gives the covariance of these forces.
 
         Args:
             step: Shift in m. It is at least the spacing of the points at which the traction is

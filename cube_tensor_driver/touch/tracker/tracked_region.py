@@ -33,12 +33,13 @@ traction on nodes. On a square grid they lie within 2.2, 2 and 1.4 pitches (dist
 neighbouring cubes). The first number that does not give more than `MAX_CUBES` cubes is used."""
 
 MAX_CHANGE = 0.25
-"""Relative change since the last fit of the traction on nodes above which the region is fitted
-again.
+"""Largest relative change of a region of contact for which the last fit of its traction stays in
+use. After a larger change, the traction on nodes (small contacts on a grid) is fitted again.
 
-The change is the largest of three: that of the largest pressure, the share of surface points that
-have joined the region, and the share that has left it. The fit depends on the pressure, because the
-assumed noise includes errors of the pads' gains, which are proportional to the stress.
+The change is the largest of three numbers: the relative change of the region's largest pressure,
+the share of surface points that have joined the region, and the share that has left it. The fit
+depends on the pressure, because the assumed noise includes errors of the pads' gains, which are
+proportional to the stress.
 """
 
 MAX_OTHERS_CHANGE = 0.3
@@ -98,12 +99,13 @@ which the skin is laid flat for the fit, in pitches (distances of neighbouring c
 distance, the cube nearest to the contacts becomes the home cube."""
 
 MAX_STALE_CHANGE = 0.06
-"""Ratio from which on the stress that the contacts of a region cause in distant cubes is computed
-again: the relative change of the contacts, divided by the relative standard deviation of this
-stress (`FIT_ERROR`, `START_ERROR`).
+"""Factor in the limit from which on a change of a region's contacts makes it necessary to compute
+again the stress that they cause in distant cubes.
 
-The relative change is the larger one of two ratios: the shift of the contacts divided by the
-distance of the nearest other region, and the change of force divided by the largest force.
+The limit is this factor times the relative standard deviation of this stress (`FIT_ERROR` or
+`START_ERROR`), so that the outdated stress is wrong by much less than assumed anyway. Two
+changes are compared with the limit: the shift of a contact divided by the distance of the nearest
+other region, and the change of a force divided by the largest force.
 """
 
 START_ERROR = 0.15
@@ -119,8 +121,11 @@ change it by 3 % each (sensitivity.py). With the value 1 % and an error of Poiss
 forces of fourteen contacts were off by 2.2 stated deviations."""
 
 MAX_STEPS = 10
-"""Largest number of Gauss-Newton steps in the first fit of Hertz contacts. Later, it is the largest
-number of additional steps in one scan (set of values of all cubes)."""
+"""Largest number of Gauss-Newton steps in the first fit of Hertz contacts.
+
+Later, a fit makes one step in each scan (set of values of all cubes). While its contacts move or
+its misfit has grown, it makes up to this number of further steps in the same scan.
+"""
 
 HOPELESS = 4.0
 """Misfit (chi-squared per known value) of the first fit of a Hertz contact after half of its
@@ -355,8 +360,11 @@ class TrackedRegion:
 
     @property
     def discs(self) -> tuple[int, Discs]:
-        """Index of the home cube (around which the skin is laid flat), and Hertz contacts in its
-        frame that act on distant cubes like the traction of this region."""
+        """Index of the home cube of this region, and Hertz contacts that replace its traction.
+
+        The contacts cause nearly the same stress in distant cubes as the traction. They are in the
+        frame of the home cube, around which the skin is laid flat.
+        """
         if self.fit is not None:
             return self.fit.values.home, self.fit.discs
         return self.home, self._start
