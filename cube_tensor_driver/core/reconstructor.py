@@ -209,13 +209,7 @@ class Reconstructor:
             left_out = recorded.left_out
             known = recorded.known
             out.status[:] = recorded.status
-        return self.compensation.process(
-            rows,
-            left_out,
-            watch=health,
-            known=known,
-            out=out,
-        )
+        return self.compensation.process(rows, left_out, watch=health, known=known, out=out)
 
     def covariance(self, cube: int, left_out: int = 0) -> Array:
         """Return the covariance (15, 15) of the components of a cube's newest row.

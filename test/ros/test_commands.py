@@ -313,5 +313,5 @@ def test_a_list_of_nodes_waits_until_lost_announcements_are_repeated(monkeypatch
     )
     executor = types.SimpleNamespace(spin_once=lambda timeout_sec: None)
     session = contextlib.nullcontext(services.NodeSession(node, executor))
-    monkeypatch.setattr(services, "node_session", lambda _: session)
+    monkeypatch.setattr(services, "run_node_session", lambda _: session)
     assert services.list_nodes() == ["/driver", "/reconstruction"]

@@ -122,7 +122,7 @@ def test_what_the_parameter_cannot_be_is_one_line(skin_file, monkeypatch):
     assert parameter.find_refusal("Skin/Left_2") == parameter.find_refusal("") == ""
     assert "letters, digits, _ and /" in parameter.find_refusal("2 skins")
     values = {"hardware_name": "skin", "wrench_side": 0.0, "publish_period": 0.0}
-    node = SimpleNamespace(value=values.get)
+    node = SimpleNamespace(read_value=values.get)
     monkeypatch.setitem(sys.modules, "pal_statistics_msgs.msg", None)
     with pytest.raises(BagError, match="messages of pal_statistics_msgs are not installed") as none:
         make_state_interfaces(node, read_skin(skin_file))
@@ -130,7 +130,7 @@ def test_what_the_parameter_cannot_be_is_one_line(skin_file, monkeypatch):
     twice = SimpleNamespace(names=("c00", "skin"), name="skin", rate=None)
     with pytest.raises(ConfigError, match="rename"):
         make_state_interfaces(node, twice)
-    assert make_state_interfaces(SimpleNamespace(value=lambda name: ""), twice) is None
+    assert make_state_interfaces(SimpleNamespace(read_value=lambda name: ""), twice) is None
 
 
 def test_the_example_names_what_is_published():
@@ -174,7 +174,7 @@ def test_the_last_values_are_nan_for_longer_than_a_cycle_of_controllers(skin_fil
     values = {"hardware_name": "skin", "wrench_side": 0.0, "publish_period": 0.0}
     publishers, cleanup = {}, []
     node = SimpleNamespace(
-        value=values.get,
+        read_value=values.get,
         create_publisher=lambda kind, topic, quality: publishers.setdefault(topic, Publisher()),
         create_timer=lambda period, function: None,
         own=lambda entity: entity,
