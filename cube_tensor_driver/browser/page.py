@@ -11,10 +11,11 @@ import copy
 from collections.abc import Callable
 from functools import partial
 from html import escape
-from typing import Any
+from typing import cast
 
 import numpy as np
 import viser
+from numpy.typing import ArrayLike
 
 from ..views.scene import Quantity, Ranges
 from . import markup
@@ -343,14 +344,15 @@ class Page:
         self._cube_list.value = self._skin.names[cube]  # type: ignore[misc]
 
 
-def is_same(one: Any, other: Any) -> bool:
+def is_same(one: object, other: object) -> bool:
     """Return whether two values of a property are equal: numbers, texts, arrays, tuples of them."""
     # Comparing long texts as arrays would take much longer.
     if isinstance(one, str):
         return bool(one == other)
     if isinstance(one, tuple) and isinstance(other, tuple):
         return len(one) == len(other) and all(map(is_same, one, other))
-    return bool(np.array_equal(one, other))
+    # numpy compares any two objects, although its annotations name only some types.
+    return np.array_equal(cast(ArrayLike, one), cast(ArrayLike, other))
 
 
 def show_waiting(

@@ -10,7 +10,6 @@ which are joined to one mesh for each colour, and arrows, crosses and rings cons
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 import viser
@@ -154,9 +153,6 @@ It is relative to the pitch (distance of neighbouring cubes). At this height the
 crosses are outside of the cubes and can be seen.
 """
 
-NO_SHADOWS: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
-"""Arguments of viser for an object that neither casts nor receives shadows."""
-
 
 class Placement:
     """Transformation of the skin from its parent frame to the 3-D scene, and lengths in the scene.
@@ -258,7 +254,8 @@ class Scene:
                 *NO_MESH,
                 flat_shading=True,
                 side="double",
-                **NO_SHADOWS,
+                cast_shadow=False,
+                receive_shadow=False,
             )
             for step in range(COLOUR_STEPS + 1)
         }
@@ -513,7 +510,8 @@ class Scene:
             flat_shading=True,
             # By default viser simplifies distant meshes, but a cube cannot have fewer triangles.
             lod="off",
-            **NO_SHADOWS,
+            cast_shadow=False,
+            receive_shadow=False,
         )
 
     def _add_edges(self, api: viser.SceneApi) -> None:

@@ -12,7 +12,10 @@ import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypedDict, TypeVar
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 Number = TypeVar("Number", int, float)
 
@@ -36,9 +39,20 @@ class Output:
     kind: str
 
 
+class Settings(TypedDict, total=False):
+    """Further arguments of `ArgumentParser.add_argument`."""
+
+    default: object
+    dest: str
+    nargs: str
+    required: bool
+
+
 class Parser(argparse.ArgumentParser):
     """An ArgumentParser with error messages of two lines, which suggest similar known words."""
 
+    # The methods that override those of argparse accept the same arguments, which argparse
+    # annotates with Any.
     def __init__(self, **settings: Any) -> None:
         self._flags: list[str] = []
         self._outputs: list[Output] = []
@@ -57,19 +71,26 @@ class Parser(argparse.ArgumentParser):
         self,
         *flags: str,
         kind: str = "file",
-        **settings: Any,
+        help: str,
+        **settings: Unpack[Settings],
     ) -> None:
         """Add an option or argument that names a file or folder to write.
 
         Args:
             flags: Names of the option.
             kind: Kind of the output, see `Output`.
+            help: Help text.
             settings: Further arguments of `add_argument`. The default may be a function that
                 computes the path from the parsed options.
         """
         metavar = "DIR" if kind == "folder" else "FILE"
-        settings = {"type": Path, "metavar": metavar} | settings
-        action = self.add_argument(*flags, **settings)
+        action = self.add_argument(
+            *flags,
+            type=Path,
+            metavar=metavar,
+            help=help,
+            **settings,
+        )
         self._outputs.append(Output(flags[0], action.dest, kind))
         self.set_defaults(outputs=self._outputs)
 
@@ -78,7 +99,7 @@ class Parser(argparse.ArgumentParser):
         name: str,
         metavar: str,
         text: str,
-        **settings: Any,
+        **settings: Unpack[Settings],
     ) -> None:
         """Add an argument or option that names a file or folder to read.
 
@@ -101,7 +122,7 @@ class Parser(argparse.ArgumentParser):
         name: str,
         metavar: str,
         text: str,
-        **settings: Any,
+        **settings: Unpack[Settings],
     ) -> None:
         """Add an argument or option whose value is a text; `add_path` describes the arguments."""
         self.add_argument(
@@ -117,7 +138,7 @@ class Parser(argparse.ArgumentParser):
         kind: Callable[[str], float],
         metavar: str,
         text: str,
-        **settings: Any,
+        **settings: Unpack[Settings],
     ) -> None:
         """Add an argument or option whose value is a number.
 
@@ -222,7 +243,11 @@ class Parser(argparse.ArgumentParser):
         self.usage = f"%(prog)s {metavar} ..."
         self._passes_words, self._missing = True, missing
 
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+    def parse_known_args(
+        self,
+        args: Iterable[str] | None = None,
+        namespace: Any = None,
+    ) -> tuple[Any, list[str]]:
         words = list(args or ())
         if not self._passes_words:
             self._refuse_unknown(words)

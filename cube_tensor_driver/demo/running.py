@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from rclpy.executors import Executor
 from rclpy.node import Node
@@ -74,8 +73,7 @@ class Observer:
 
     def log_error(self, text: str) -> None:
         """Write an error message to the log of the ROS node."""
-        logger: Any = self.node.get_logger()  # type: ignore[no-untyped-call]
-        logger.error(text)
+        self.node.get_logger().error(text)  # type: ignore[no-untyped-call]
 
     def spin(
         self,

@@ -11,7 +11,6 @@ Python handles all others, for example those after lost samples or after a resta
 from __future__ import annotations
 
 from ctypes import Array, Structure, c_double, c_int64
-from typing import Any
 
 MAX_DISORDER = 64
 """Number of newest samples of a hub whose numbers and times (hub's clock) are kept, to distinguish
@@ -32,7 +31,7 @@ _TYPES: dict[str, type[c_int64 | c_double | Array[Array[c_int64]]]] = {
     "int": c_int64,
     "bool": c_int64,
     "float": c_double,
-    "list[Any]": c_int64 * 2 * MAX_DISORDER,
+    "list[list[int]]": c_int64 * 2 * MAX_DISORDER,
 }
 """Annotation of a field of `LinkTrack` -> its type in C, which native/cube_track.h repeats."""
 
@@ -91,6 +90,6 @@ class LinkTrack(Structure):
     bucket_end: float
     bucket_height: float
     earliest_ns: float
-    seen: list[Any]
+    seen: list[list[int]]
 
     _fields_ = tuple((name, _TYPES[kind]) for name, kind in __annotations__.items())

@@ -14,10 +14,10 @@ from __future__ import annotations
 import contextlib
 import math
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -439,9 +439,8 @@ class MessageCodec(Generic[AnyRows]):
         # the rows, and numpy raises a ValueError if the layout would be longer than any message.
         with contextlib.suppress(ValueError):
             layout: _Layout = self._find_layout(shape)
-            if self._has_pads:
-                fields: Mapping[str, Any] = layout.record.fields or {}
-                pads_at = fields["n_pads"][1]
+            if self._has_pads and layout.record.fields:
+                pads_at = layout.record.fields["n_pads"][1]
                 # A damaged message may be too short to have this byte. Then the check of its length
                 # below refuses it.
                 pads = data[pads_at] if pads_at < len(data) else 0

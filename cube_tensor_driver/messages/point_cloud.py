@@ -8,7 +8,7 @@ The caller passes the function that constructs a message, because this folder do
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
@@ -16,7 +16,9 @@ from ..core.arrays import Array
 from .codec import SECOND
 from .types import TRACTION
 
-MakeMessage = Callable[..., Any]
+Message = TypeVar("Message")
+
+MakeMessage = Callable[..., object]
 """Function that constructs a message. Its arguments are the name of the type, such as
 "geometry_msgs/msg/Point", and the fields by name; arrays of numbers are numpy arrays."""
 
@@ -28,12 +30,12 @@ FLOAT32_SIZE = 4
 
 
 def make_cloud_message(
-    make: MakeMessage,
+    make: Callable[..., Message],
     stamp_ns: int,
     frame_id: str,
     names: Sequence[str],
     points: Array,
-) -> Any:
+) -> Message:
     """Make a PointCloud2 message.
 
     Args:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TypedDict, cast
 
 from ..config.schema import Schema, integer, mapping, real
 from ..core.errors import ConfigError
@@ -87,6 +87,19 @@ _SCHEMA = Schema(
 """Schema of a fault."""
 
 
+class _FaultContent(TypedDict, total=False):
+    """A fault in YAML that follows the schema. `Fault` describes its values."""
+
+    kind: str
+    at: float
+    link: str
+    seconds: float
+    count: float
+    cube: float
+    pad: float
+    value: float
+
+
 @dataclass(frozen=True)
 class Fault:
     """One fault of a simulated hub. `KINDS` names the attributes that each kind uses.
@@ -112,7 +125,7 @@ class Fault:
     value: float = 1e-3
 
     @classmethod
-    def parse(cls, data: Any, place: str) -> Fault:
+    def parse(cls, data: object, place: str) -> Fault:
         """Create a fault from plain values and check them.
 
         Args:
@@ -125,13 +138,18 @@ class Fault:
         """
         for _, mistake in _SCHEMA.find_mistakes(data):
             raise ConfigError(f"{place}: {mistake}")
-        defaults: dict[str, Any] = {"kind": "", **vars(cls)}
-        values = {}
-        for key, value in data.items():
-            # YAML may contain 2 where a float is needed, and 2.0 where an integer is needed.
-            to_type = type(defaults[key])
-            values[key] = to_type(value)
-        return cls(**values)
+        values = cast(_FaultContent, data)
+        # YAML may contain 2 where a float is needed, and 2.0 where an integer is needed.
+        return cls(
+            kind=values["kind"],
+            at=float(values.get("at", cls.at)),
+            link=values.get("link", cls.link),
+            seconds=float(values.get("seconds", cls.seconds)),
+            count=int(values.get("count", cls.count)),
+            cube=int(values.get("cube", cls.cube)),
+            pad=int(values.get("pad", cls.pad)),
+            value=float(values.get("value", cls.value)),
+        )
 
 
 def parse_faults(data: object, place: str) -> list[Fault]:

@@ -35,7 +35,7 @@ Source: K. L. Johnson, Contact Mechanics (1985), 7.1 (sliding) and 7.2 (partial 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -53,6 +53,9 @@ STICK = 1
 """State of a contact that keeps its place on the skin; its rim may slip."""
 SLIP = 2
 """State of a contact whose whole area slides over the skin (gross slip)."""
+
+Field = tuple[str, type, tuple[int, ...]]
+"""Name, type of the values and shape of a field of a structured array."""
 
 N_CUBES = 16
 """Number of cubes nearest to a contact from whose values its force and position are computed in
@@ -237,12 +240,12 @@ class SlipEstimator:
         n_scans = LAGS[-1] + 1
         # The following are the fields of one contact. A load is force (3) in N and position (3) in
         # m. The matrix `weights` converts changes of the cubes' values, in Pa, to changes of it.
-        linear: list[tuple[str, type, tuple[int, ...]]] = [
+        linear: list[Field] = [
             ("cubes", int, (count,)),
             ("weights", float, (6, n_values)),
             ("values", float, (n_values,)),
         ]
-        fields: list[tuple[str, Any, tuple[int, ...]]] = [
+        fields: list[tuple[str, type | list[Field], tuple[int, ...]]] = [
             ("id", int, ()),
             ("normal", float, (3,)),
             ("radius", float, ()),

@@ -256,7 +256,7 @@ class SequenceTracker:
             arrival: Class of the sample (new, late …), which is returned.
         """
         self.counters.delivered += 1
-        self._track.seen[number % MAX_DISORDER] = number, device_us
+        self._track.seen[number % MAX_DISORDER][:] = number, device_us
         return arrival
 
     def _list_seen(self) -> list[tuple[int, int]]:

@@ -193,7 +193,7 @@ class ForceCloud:
         # The message is made once, and later only its data and stamp are replaced. The description
         # of its fields consists of many Python objects that never change.
         points = np.zeros((len(skin.cubes), len(FORCE_FIELDS)))
-        self._message = make_cloud_message(
+        self._message: PointCloud2 = make_cloud_message(
             make_message,
             0,
             skin.parent_frame,

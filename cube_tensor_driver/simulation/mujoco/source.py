@@ -32,7 +32,9 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -64,20 +66,19 @@ MIN_WIDTH_DEPTHS = 0.3
 touches along a line or at an edge gets this width."""
 
 
-def load_mujoco() -> Any:
+def load_mujoco() -> ModuleType:
     """Import the module mujoco.
 
     Raises:
         ConfigError: It is not installed.
     """
     try:
-        import mujoco
+        return import_module("mujoco")
     except ModuleNotFoundError:
         raise ConfigError(
             "MuJoCo is not installed: pip install 'cube-tensor-driver[mujoco]', or pip install "
             "mujoco in the environment of this program"
         ) from None
-    return mujoco
 
 
 class _BodyCubes(NamedTuple):
