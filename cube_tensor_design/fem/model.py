@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from cube_tensor_driver.config.calibration import (
     find_calibration,
@@ -134,9 +134,11 @@ def read_model(name: str | None) -> Model:
         Path(),
         "a model file, or one of the shipped models",
     )
-    data = read_yaml(path) or {}
-    for _, mistake in _SCHEMA.find_mistakes(data):
+    content = read_yaml(path) or {}
+    for _, mistake in _SCHEMA.find_mistakes(content):
         raise ConfigError(f"{path}: {mistake}")
+    # The schema has checked the types of all values.
+    data = cast("Mapping[str, Any]", content)
     try:
         return _build_model(data, path.parent)
     except CubeError as error:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from .parser import Parser
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from ..calibrate.pad_rest import PadsAtRest
     from ..calibrate.presses import Explanation, SteadyPress
-    from ..config.skin import Skin
+    from ..config.skin import Skin, SkinContent
     from ..device.live import LinkSource
 
 REST_S = 5.0
@@ -110,7 +110,7 @@ def run(options: argparse.Namespace) -> int:
     return 0 if np.all(rest.works & ~rest.noisy) else 1
 
 
-def describe_skin_of_hub(options: argparse.Namespace) -> tuple[dict[str, Any], Skin]:
+def describe_skin_of_hub(options: argparse.Namespace) -> tuple[SkinContent, Skin]:
     """Ask the hub at the port for its cubes, and describe them as a skin.
 
     Args:

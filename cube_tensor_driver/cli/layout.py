@@ -6,11 +6,12 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from .parser import Parser
 
 if TYPE_CHECKING:
+    from ..core.estimator import ResponseSummary
     from ..core.layout import Layout
 
 
@@ -97,7 +98,7 @@ def run(options: argparse.Namespace) -> int:
 def show_layout(
     layout: Layout,
     symmetry: str,
-    result: dict[str, Any],
+    result: ResponseSummary,
     source: str,
 ) -> None:
     """Print what the pads of a layout can measure: ranks, condition numbers and noise.
@@ -120,17 +121,20 @@ def show_layout(
     say(f"coefficients by symmetry: {', '.join(counts)}")
     say(f"symmetry {symmetry}; {source}")
 
-    for part in ("uniform", "gradient"):
-        condition = result[f"condition_{part}"]
+    parts = (
+        ("uniform:", result["rank_uniform"], result["condition_uniform"]),
+        ("gradient:", result["rank_gradient"], result["condition_gradient"]),
+    )
+    for part, rank, condition in parts:
         text = "unknown" if condition is None else f"{condition:.3g}"
-        say(f"{part + ':':10} rank {result[f'rank_{part}']}, condition {text}")
+        say(f"{part:10} rank {rank}, condition {text}")
     say(f"unobservable: {', '.join(result['unobservable']) or 'nothing'}")
     say("noise of each mode per unit of pad noise (gradients times the half side):")
     rows = [(name, describe_noise(result, name)) for name in result["modes"]]
     print_table(("mode",), ("noise",), rows)
 
 
-def describe_noise(result: dict[str, Any], mode: str) -> str:
+def describe_noise(result: ResponseSummary, mode: str) -> str:
     """Return the standard deviation of a mode per unit of pad noise as text, or why it is unknown.
 
     Args:

@@ -215,7 +215,9 @@ def read_contact_options(options: argparse.Namespace) -> ContactOptions | None:
         refusal = known[name].find_refusal(values[name])
         if refusal:
             raise ConfigError(f"--contacts {text}: {refusal}")
-    rate = values.pop("rate")
-    settings = ContactSettings(method, **values)
+    rate = float(values.pop("rate"))
+    influence = str(values.pop("influence"))
+    numbers = {name: float(value) for name, value in values.items()}
+    settings = ContactSettings(method, influence=influence, **numbers)
     settings.check()
     return ContactOptions(settings, rate)

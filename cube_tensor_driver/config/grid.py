@@ -4,9 +4,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 from ..core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from .skin import CubeEntry, PoseEntry, SkinContent
 
 MAX_CUBES = 1 << 16
 """Maximum number of cubes of a skin. Messages give the index of a cube as a 16-bit integer."""
@@ -30,7 +33,7 @@ def describe_grid(
     calibration: str | None = None,
     layout: str = "planar",
     port: str = "/dev/ttyACM{}",
-) -> dict[str, Any]:
+) -> SkinContent:
     """Return the content of a skin file with nx × ny cubes in the x-y plane of the parent frame.
 
     The grid is centred on the origin of the frame. Cubes are numbered row by row: the x coordinate
@@ -62,18 +65,18 @@ def describe_grid(
     # Names have leading zeros (c00, c01, ...), so that sorting them by text gives the same order as
     # sorting the cubes by number.
     digits = len(str(n_cubes - 1))
-    cubes = []
+    cubes: list[CubeEntry] = []
     for number in range(n_cubes):
         # Integer division gives every link n_cubes / links cubes, rounded down or up.
         link = number * links // n_cubes
         first_of_link = -(-link * n_cubes // links)  # number of its first cube, rounded up
         x = (number % nx - (nx - 1) / 2) * pitch
         y = (number // nx - (ny - 1) / 2) * pitch
-        pose = {
+        pose: PoseEntry = {
             "xyz": [round(x, 9), round(y, 9), 0.0],
             "rpy": [0.0, 0.0, 0.0],
         }
-        cube = {
+        cube: CubeEntry = {
             "name": f"c{number:0{digits}d}",
             "link": f"hub{link}",
             "index": number - first_of_link,

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TypedDict, cast
 
 import numpy as np
 
@@ -125,6 +125,42 @@ _SCHEMA = Schema(
 )
 """Schema of a load script, the YAML file that states which forces indenters exert over time."""
 
+_ActionEntry = TypedDict(
+    "_ActionEntry",
+    {
+        "from": float,
+        "to": float,
+        "at": list[float],
+        "path": list[list[float]],
+        "force": float | list[float],
+        "shear": list[float] | list[list[float]],
+        "times": int,
+    },
+    total=False,
+)
+"""Keys of an action in a load script, see `_ACTIONS`."""
+
+
+class _IndenterEntry(TypedDict, total=False):
+    """Keys of an indenter in a load script, see `_INDENTER`."""
+
+    name: str
+    shape: str
+    radius: float
+    friction: float
+    does: list[dict[str, _ActionEntry]]
+
+
+class _ScriptContent(TypedDict, total=False):
+    """Content of a load script, see `_SCHEMA`."""
+
+    period: float
+    depth: float
+    young: float
+    poisson: float
+    places: str
+    indenters: list[_IndenterEntry]
+
 
 @dataclass(frozen=True)
 class Action:
@@ -204,10 +240,12 @@ def read_script(path: Path) -> Script:
         ConfigError: The file cannot be read or has a mistake. The message names the file, the key
             of the first mistake, the value found there and the values that are allowed.
     """
-    data = read_yaml(path)
-    for _, mistake in _SCHEMA.find_mistakes(data):
+    content = read_yaml(path)
+    for _, mistake in _SCHEMA.find_mistakes(content):
         raise ConfigError(f"{path}: {mistake}")
 
+    # The schema has checked the types of all values.
+    data = cast("_ScriptContent", content)
     period = data.get("period")
     script = Script(
         period=None if period is None else float(period),
@@ -244,7 +282,7 @@ def interpolate_knots(knots: Array, when: float | Array) -> Array:
     return value
 
 
-def _make_indenter(item: dict[str, Any]) -> Indenter:
+def _make_indenter(item: _IndenterEntry) -> Indenter:
     actions = []
     for does in item["does"]:
         for kind, keys in does.items():
@@ -260,12 +298,12 @@ def _make_indenter(item: dict[str, Any]) -> Indenter:
     )
 
 
-def _make_action(kind: str, item: dict[str, Any]) -> Action:
+def _make_action(kind: str, item: _ActionEntry) -> Action:
     places = item["path"] if "path" in item else [item["at"]]
     path = np.array(places, float)
     force = np.array(item["force"], float)
     if kind == "tap":
-        peak = float(item["force"])
+        peak = float(force)
         # In each tap the force rises from 0 to the peak and falls to 0.
         n_taps = item.get("times", 1)
         force = np.array([0.0, *[peak, 0.0] * n_taps])

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple, cast
 
 from ..core.defaults import CONTACT_METHODS, CONTACT_PRESSURE, POISSONS_RATIO, SURFACE_DEPTH
 from ..core.modes import STRESS
@@ -20,6 +20,9 @@ from .port import find_port_problem
 
 QUANTITIES = ("pressure", "shear", "gradient", *STRESS, "residual")
 """Names of the quantities that the colours of the cubes can show in RViz and Foxglove."""
+
+ParameterValue = bool | float | str
+"""Value of a ROS parameter of the nodes."""
 
 
 def find_hardware_problem(name: str) -> str:
@@ -49,7 +52,7 @@ class Parameter(NamedTuple):
     """
 
     name: str
-    default: Any
+    default: ParameterValue
     description: str
     span: tuple[float, float] | None = None
     choices: str = ""
@@ -57,7 +60,7 @@ class Parameter(NamedTuple):
     minimum: float | None = None
     problem: Callable[[str], str] | None = None
 
-    def parse(self, text: str) -> Any:
+    def parse(self, text: str) -> ParameterValue:
         """Convert a text into a value of the parameter's type: bool, float or str.
 
         If the parameter is a number but the text is not, the result is NaN, which `find_refusal`
@@ -72,7 +75,7 @@ class Parameter(NamedTuple):
         except ValueError:
             return math.nan
 
-    def find_refusal(self, value: Any) -> str:
+    def find_refusal(self, value: ParameterValue) -> str:
         """Return an error message if the parameter does not allow a value; "" if it does.
 
         Args:
@@ -83,14 +86,18 @@ class Parameter(NamedTuple):
             return f"{found}, allowed: {self.choices}"
         if self.span is not None:
             low, high = self.span
-            is_zero = self.minimum is not None and value == 0
+            number = cast("float", value)  # only numbers have a span
+            is_zero = self.minimum is not None and number == 0
             # The comparison is false for NaN, so that NaN is refused, too.
-            if not (is_zero or (self.minimum or low) <= value <= high):
+            if not (is_zero or (self.minimum or low) <= number <= high):
                 allowed = f"{low:g} to {high:g}"
                 if self.minimum:
                     allowed = f"0, or {self.minimum:g} to {high:g}"
                 return f"{found}, allowed: {allowed}"
-        problem = self.problem(value) if self.problem is not None and value else ""
+        if self.problem is None or not value:
+            return ""
+        text = cast("str", value)  # only texts have such a function
+        problem = self.problem(text)
         return f"parameter {self.name}: {problem}" if problem else ""
 
 

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -46,7 +46,8 @@ def make_rviz_view(skin: Skin) -> dict[str, object]:
     diagonal = float(np.linalg.norm(high - low))
     focal_point = (low + high) / 2
 
-    view: dict[str, Any] = read_yaml(find_package_data() / "rviz" / "skin.rviz")
+    content = read_yaml(find_package_data() / "rviz" / "skin.rviz")
+    view = cast("dict[str, Any]", content)
     manager = view["Visualization Manager"]
     manager["Global Options"]["Fixed Frame"] = skin.parent_frame
     displays = {display["Name"]: display for display in manager["Displays"]}

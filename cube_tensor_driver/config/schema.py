@@ -9,8 +9,7 @@ allowed. The text for the allowed values is the `description` of the schema at t
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Iterable, Mapping
 
 import jsonschema
 
@@ -18,7 +17,7 @@ KeyPath = tuple[str | int, ...]
 """Position of a value in nested mappings and lists: the keys and list indices that lead to it from
 the top level, as in ("cubes", 3, "pose")."""
 
-JsonSchema = dict[str, Any]
+JsonSchema = dict[str, object]
 """A JSON schema, draft 7."""
 
 MAX_SHOWN_CHARACTERS = 60
@@ -55,7 +54,7 @@ _NUMBER_WORDS = {1: "one", 2: "two"}
 """Words for small numbers in error messages."""
 
 
-def mapping(required: Iterable[str], properties: JsonSchema) -> JsonSchema:
+def mapping(required: Iterable[str], properties: Mapping[str, object]) -> JsonSchema:
     """Return the JSON schema of a mapping.
 
     Args:
@@ -173,17 +172,16 @@ def _format_key(path: Iterable[str | int]) -> str:
 
 def _describe(error: jsonschema.ValidationError) -> str:
     key = _format_key(error.absolute_path)
-    schema: JsonSchema = error.schema
     if error.validator == "additionalProperties":
-        allowed = schema["properties"]
+        allowed: JsonSchema = error.schema["properties"]
         unknown = ", ".join(repr(name) for name in error.instance if name not in allowed)
         return f"{key}: unknown key {unknown}, allowed: {', '.join(allowed)}"
     if error.validator == "required":
-        required = schema["required"]
+        required: list[str] = error.schema["required"]
         missing = ", ".join(repr(name) for name in required if name not in error.instance)
         return f"{key}: the key {missing} is missing"
 
     found = repr(error.instance)
     if len(found) > MAX_SHOWN_CHARACTERS:
         found = found[: MAX_SHOWN_CHARACTERS - 3] + "..."
-    return f"{key}: found {found}, allowed: {schema.get('description', error.message)}"
+    return f"{key}: found {found}, allowed: {error.schema.get('description', error.message)}"

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from glob import has_magic
 from pathlib import Path
-from typing import Any
+from typing import TypedDict, cast
 
 import numpy as np
 
@@ -107,6 +107,45 @@ _SCHEMA = Schema(
     )
 )
 """Schema of a skin file."""
+
+
+class LinkEntry(TypedDict, total=False):
+    """Keys of a link in a skin file, see `_LINK`."""
+
+    name: str
+    port: str
+    baud: int
+    hub_uid: int | str
+
+
+class PoseEntry(TypedDict):
+    """Keys of the pose of a cube in a skin file."""
+
+    xyz: list[float]
+    rpy: list[float]
+
+
+class CubeEntry(TypedDict, total=False):
+    """Keys of a cube in a skin file, see `_CUBE`."""
+
+    name: str
+    link: str
+    index: int
+    uid: int | str
+    pose: PoseEntry
+    layout: str
+    calibration: str
+
+
+class SkinContent(TypedDict, total=False):
+    """Content of a skin file, see `_SCHEMA`."""
+
+    name: str
+    parent_frame: str
+    rate: float
+    elastomer: dict[str, float]
+    links: list[LinkEntry]
+    cubes: list[CubeEntry]
 
 
 @dataclass(frozen=True)
@@ -277,24 +316,31 @@ def check_skin(path: Path) -> tuple[Skin | None, list[str]]:
 
 
 def check_skin_data(
-    data: object,
+    content: object,
     folder: Path,
 ) -> tuple[Skin | None, list[str]]:
     """Check the content of a skin file.
 
     Args:
-        data: The content of the file, as plain values (mappings, lists, numbers, texts).
+        content: The content of the file, as plain values (mappings, lists, numbers, texts).
         folder: The folder in which the file is or will be. Calibrations are named relative to it.
 
     Returns:
         The skin and an empty list, or None and the mistakes, one line each. If the JSON schema
         finds mistakes, only these are returned; otherwise those that concern several keys or files.
     """
-    mistakes = [line for _, line in _SCHEMA.find_mistakes(data)]
-    if mistakes or not isinstance(data, dict):
+    mistakes = [line for _, line in _SCHEMA.find_mistakes(content)]
+    if mistakes:
         return None, mistakes
+    # The schema has checked the types of all values.
+    data = cast("SkinContent", content)
     links = tuple(
-        SkinLink(item["name"], item["port"], item.get("baud", BAUD), _parse_uid(item, "hub_uid"))
+        SkinLink(
+            item["name"],
+            item["port"],
+            item.get("baud", BAUD),
+            _parse_uid(item.get("hub_uid")),
+        )
         for item in data["links"]
     )
     elastomer = None
@@ -334,7 +380,7 @@ def check_skin_data(
 
 
 def _read_cubes(
-    items: list[dict[str, Any]],
+    items: list[CubeEntry],
     folder: Path,
     links: list[str],
 ) -> tuple[tuple[SkinCube, ...], list[str]]:
@@ -367,7 +413,7 @@ def _read_cubes(
             name=item["name"],
             link=item.get("link"),
             index=item.get("index"),
-            uid=_parse_uid(item, "uid"),
+            uid=_parse_uid(item.get("uid")),
             xyz=_to_triple(item["pose"]["xyz"]),
             rpy=_to_triple(item["pose"]["rpy"]),
             calibration=calibration,
@@ -380,7 +426,7 @@ def _read_cubes(
 
 def _find_contradictions(
     cube: SkinCube,
-    item: dict[str, object],
+    item: CubeEntry,
     links: list[str],
 ) -> Iterator[str]:
     """Yield a mistake for each key of a cube that contradicts a link or the calibration.
@@ -470,8 +516,7 @@ def _find_repeated(
             yield f"{where}: the {what} {value} appears {times}; keep one"
 
 
-def _parse_uid(item: dict[str, Any], key: str) -> int | None:
-    value = item.get(key)
+def _parse_uid(value: int | str | None) -> int | None:
     return int(value, 16) if isinstance(value, str) else value
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict, cast
 
 import numpy as np
 
@@ -39,6 +39,13 @@ class StoredTare(NamedTuple):
 
     rest_frequency: Array
     created: datetime
+
+
+class _TareContent(TypedDict):
+    """Keys of a tare file that `StoredTare` contains, see `_tare_schema`."""
+
+    rest_frequency: list[float]
+    created: str
 
 
 def tare_path(folder: Path, uid: int) -> Path:
@@ -102,9 +109,11 @@ def read_tare(
     path = tare_path(folder, uid)
     if not path.exists():
         return None
-    data = read_yaml(path)
-    for _, mistake in _tare_schema(uid, calibration).find_mistakes(data):
+    content = read_yaml(path)
+    for _, mistake in _tare_schema(uid, calibration).find_mistakes(content):
         raise ConfigError(f"{path}: {mistake}; tare again")
+    # The schema has checked the types of all values.
+    data = cast("_TareContent", content)
     try:
         # Times with and without a zone cannot be compared, so one without is taken as local time.
         created = datetime.fromisoformat(data["created"]).astimezone()

@@ -9,7 +9,7 @@ maximum size, deeply nested values, and mappings in which a key appears twice.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import yaml
 
@@ -63,7 +63,7 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
         return mapping
 
 
-def parse_yaml(text: str | bytes, origin: str) -> Any:
+def parse_yaml(text: str | bytes, origin: str) -> object:
     """Return the plain Python value of a YAML text.
 
     Args:
@@ -102,11 +102,12 @@ def _check_depth(text: str | bytes) -> None:
             depth -= 1
         if depth > MAX_DEPTH:
             problem = f"more than {MAX_DEPTH} lists and mappings within each other; use fewer"
-            mark: Any = event.start_mark
+            # PyYAML's marks in C have the attributes of those in Python.
+            mark = cast("yaml.Mark", event.start_mark)
             raise yaml.MarkedYAMLError(problem=problem, problem_mark=mark)
 
 
-def read_yaml(path: Path) -> Any:
+def read_yaml(path: Path) -> object:
     """Return the plain Python value of a YAML file.
 
     Raises:

@@ -9,7 +9,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -304,7 +303,7 @@ class Calibration:
         return content
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Calibration:
+    def from_dict(cls, data: object) -> Calibration:
         """Construct a calibration from types that JSON has, as a file holds them.
 
         If the data have an id, it must be the hash of the content. Data without an id are accepted,

@@ -28,7 +28,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 
@@ -301,61 +301,80 @@ def estimate_modes(
     )
 
 
+class ResponseSummary(TypedDict):
+    """Which modes a response determines, and how well, in types that JSON has.
+
+    None stands for a value that does not exist.
+
+    Attributes:
+        pads: Names of the pads.
+        modes: Names of the modes.
+        n_coefficients: Number of coefficients of the response.
+        rank_uniform: Rank of the columns of the response for modes of uniform stress.
+        condition_uniform: Condition number of the same columns.
+        rank_gradient: Rank of the columns of the response for modes with a gradient.
+        condition_gradient: Condition number of the same columns.
+        unobservable: Names of modes that the pads do not determine.
+        noise: Standard deviation of each mode's amplitude if every pad's stress has the standard
+            deviation 1.
+    """
+
+    pads: list[str]
+    modes: list[str]
+    n_coefficients: int
+    rank_uniform: int
+    condition_uniform: float | None
+    rank_gradient: int
+    condition_gradient: float | None
+    unobservable: list[str]
+    noise: dict[str, float | None]
+
+
 def summarize_response(
     structure: Structure,
     response: Array,
     neglect: Sequence[str] = (),
-) -> dict[str, Any]:
-    """Summarise which modes a response determines, and how well, in types that JSON has.
+) -> ResponseSummary:
+    """Summarise which modes a response determines, and how well.
 
     Args:
         structure: Layout and modes of the response.
         response: Response (P, M), in Pa per Pa.
         neglect: Names of modes whose amplitude is assumed to be zero.
-
-    Returns:
-        A table with the keys
-
-        - pads, modes, n_coefficients: names of the pads and of the modes, and the number of
-          coefficients of a response;
-        - rank_uniform, rank_gradient: ranks of the columns of the response for modes of uniform
-          stress, and of those for modes with a gradient;
-        - condition_uniform, condition_gradient: condition numbers of the same columns;
-        - unobservable: names of modes that the pads do not determine;
-        - noise: standard deviation of each mode's amplitude if every pad's stress has the standard
-          deviation 1.
-
-        None stands for a value that does not exist.
     """
     modes = structure.modes
     estimator = estimate_modes(response, modes, neglect)
-    result: dict[str, Any] = {
-        "pads": list(structure.layout.pads),
-        "modes": list(modes.names),
-        "n_coefficients": structure.n_coefficients,
-    }
     is_kept = ~np.isin(modes.names, neglect)
-    parts = {
-        "uniform": np.any(modes.stress, axis=(1, 2)),
-        "gradient": np.any(modes.gradient, axis=(1, 2, 3)),
-    }
-    for part, columns in parts.items():
-        kept_response = response[:, columns & is_kept]
-        s = np.linalg.svd(kept_response, compute_uv=False)
-        if s.size:
-            s = s[s > RANK_TOLERANCE * s[0]]
-        result[f"rank_{part}"] = len(s)
-        condition = float(s[0] / s[-1]) if s.size else None
-        result[f"condition_{part}"] = condition
+    is_uniform = np.any(modes.stress, axis=(1, 2))
+    is_gradient = np.any(modes.gradient, axis=(1, 2, 3))
+    rank_uniform, condition_uniform = _find_rank(response[:, is_uniform & is_kept])
+    rank_gradient, condition_gradient = _find_rank(response[:, is_gradient & is_kept])
 
     deviations = np.sqrt(np.diag(estimator.covariance)).tolist()
     noise = {
         name: None if math.isnan(deviation) else deviation
         for name, deviation in zip(modes.names, deviations, strict=True)
     }
-    result["unobservable"] = [name for name, value in noise.items() if value is None]
-    result["noise"] = noise
-    return result
+    return {
+        "pads": list(structure.layout.pads),
+        "modes": list(modes.names),
+        "n_coefficients": structure.n_coefficients,
+        "rank_uniform": rank_uniform,
+        "condition_uniform": condition_uniform,
+        "rank_gradient": rank_gradient,
+        "condition_gradient": condition_gradient,
+        "unobservable": [name for name, value in noise.items() if value is None],
+        "noise": noise,
+    }
+
+
+def _find_rank(columns: Array) -> tuple[int, float | None]:
+    """Return rank and condition number (None if the rank is 0) of columns of a response."""
+    s = np.linalg.svd(columns, compute_uv=False)
+    if s.size:
+        s = s[s > RANK_TOLERANCE * s[0]]
+    condition = float(s[0] / s[-1]) if s.size else None
+    return len(s), condition
 
 
 def chi2_tail(x: float, dof: int) -> float:

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Iterable
 from datetime import datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from launch import Action, LaunchContext
@@ -194,7 +194,7 @@ def record_skin(
 def _list_recorded_topics(
     surroundings: dict[str, Any],
     namespace: str,
-) -> dict[str, dict[str, str]]:
+) -> dict[str, dict[str, object]]:
     """Return the full names of the recorded topics and the quality of service of each.
 
     Args:
@@ -210,7 +210,8 @@ def _list_recorded_topics(
     reliability = parameters.get("qos_reliability", "reliable")
 
     qualities = {}
-    for topic, quality in read_yaml(RECORD_QOS).items():
+    shipped = cast("dict[str, dict[str, object]]", read_yaml(RECORD_QOS))
+    for topic, quality in shipped.items():
         name = topic.removeprefix("/")
         name = remaps.get(name, name)
         prefix = f"/{namespace}" if namespace else ""

@@ -211,7 +211,9 @@ def read_imperfections(path: Path) -> Imperfections:
         ConfigError: A key is unknown, or a value is wrong.
     """
     data = read_yaml(path)
-    for _, mistake in _SCHEMA.find_mistakes(data):
+    mistakes = _SCHEMA.find_mistakes(data)
+    if mistakes or not isinstance(data, dict):
+        _, mistake = mistakes[0]
         raise ConfigError(f"{path}: {mistake}")
     # Lists become tuples, because an instance of `Imperfections` is immutable.
     for name in _TABLES & data.keys():

@@ -9,6 +9,7 @@ import os
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import cast
 
 from ..config.yaml import parse_yaml, read_yaml, to_yaml
 from ..core.errors import ConfigError
@@ -48,7 +49,7 @@ def inject(ports: Path | None, words: Sequence[str]) -> str:
     with os.fdopen(_open_pipe(folder / FAULT_PIPE), "w") as stream:
         # The simulator writes the file with the sizes of its hubs before it creates the pipe, so
         # the file exists.
-        sizes = read_yaml(folder / HUBS_FILE)
+        sizes = cast("dict[str, dict[str, int]]", read_yaml(folder / HUBS_FILE))
         hubs = {name: HubSize(**size) for name, size in sizes.items()}
         links = check_target(parsed, hubs)
         stream.write(format_fault(fault))

@@ -21,7 +21,7 @@ Source: H. S. Carslaw, J. C. Jaeger, Conduction of Heat in Solids (1959), 3.11.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict, cast
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
@@ -65,6 +65,15 @@ class ThermalLayer(NamedTuple):
     pads: Array
 
 
+class _ThermalContent(TypedDict):
+    """Keys of a file of thermal stress that `read_thermal_stress` uses."""
+
+    height: float
+    depth: float
+    side: float
+    pads: list[list[float]]
+
+
 def read_thermal_stress(name: str, n_pads: int) -> ThermalLayer:
     """Read a file of thermal stress that `./cube fem --load temperature -o` has written.
 
@@ -76,14 +85,14 @@ def read_thermal_stress(name: str, n_pads: int) -> ThermalLayer:
         ConfigError: There is no such file, or it has another number of pads.
     """
     advice = "a file of ./cube fem --load temperature"
-    data = read_yaml(
-        find_shipped(
-            "thermal/*.yaml",
-            name,
-            Path(),
-            advice,
-        )
+    file = find_shipped(
+        "thermal/*.yaml",
+        name,
+        Path(),
+        advice,
     )
+    # Content of another kind raises an error while the layer is made of it.
+    data = cast("_ThermalContent", read_yaml(file))
     try:
         pads = np.array(data["pads"], float)
         layer = ThermalLayer(

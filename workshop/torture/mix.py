@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -33,7 +33,7 @@ key `action`; other keys are its values."""
 CYCLE_S = 30.0
 """Time, in seconds, after which the actions of `CYCLE` are repeated."""
 
-CYCLE: dict[float, Event] = read_yaml(Path(__file__).with_name("cycle.yaml"))
+CYCLE = cast("dict[float, Event]", read_yaml(Path(__file__).with_name("cycle.yaml")))
 """Events of each cycle, by time in seconds after its begin."""
 
 FIRST_CYCLE_ONLY = ("restart reconstruction", "restart driver")

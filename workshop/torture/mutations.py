@@ -15,7 +15,7 @@ from importlib import import_module
 from importlib.util import find_spec, module_from_spec
 from pathlib import Path
 from textwrap import indent
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 from cube_tensor_driver.config.yaml import read_yaml
 from cube_tensor_driver.core.errors import ConfigError
@@ -37,9 +37,15 @@ class Mutation(NamedTuple):
     edits: Sequence[Edit]
 
 
+_CONTENT = cast(
+    "dict[str, dict[str, list[Edit]]]",
+    read_yaml(Path(__file__).with_suffix(".yaml")),
+)
+"""Content of `mutations.yaml`: edits by name of the mutation, by node."""
+
 MUTATIONS = {
     name: Mutation(node, edits)
-    for node, by_name in read_yaml(Path(__file__).with_suffix(".yaml")).items()
+    for node, by_name in _CONTENT.items()
     for name, edits in by_name.items()
 }
 """All mutations by name."""
