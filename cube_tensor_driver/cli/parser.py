@@ -12,10 +12,7 @@ import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, TypedDict, TypeVar
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
+from typing import Any, NoReturn, TypeVar
 
 Number = TypeVar("Number", int, float)
 
@@ -39,20 +36,10 @@ class Output:
     kind: str
 
 
-class Settings(TypedDict, total=False):
-    """Further arguments of `ArgumentParser.add_argument`."""
-
-    default: object
-    dest: str
-    nargs: str
-    required: bool
-
-
 class Parser(argparse.ArgumentParser):
     """An ArgumentParser with error messages of two lines, which suggest similar known words."""
 
-    # The methods that override those of argparse accept the same arguments, which argparse
-    # annotates with Any.
+    # The methods pass their further arguments to argparse, which annotates them with Any.
     def __init__(self, **settings: Any) -> None:
         self._flags: list[str] = []
         self._outputs: list[Output] = []
@@ -71,26 +58,19 @@ class Parser(argparse.ArgumentParser):
         self,
         *flags: str,
         kind: str = "file",
-        help: str,
-        **settings: Unpack[Settings],
+        **settings: Any,
     ) -> None:
         """Add an option or argument that names a file or folder to write.
 
         Args:
             flags: Names of the option.
             kind: Kind of the output, see `Output`.
-            help: Help text.
             settings: Further arguments of `add_argument`. The default may be a function that
                 computes the path from the parsed options.
         """
         metavar = "DIR" if kind == "folder" else "FILE"
-        action = self.add_argument(
-            *flags,
-            type=Path,
-            metavar=metavar,
-            help=help,
-            **settings,
-        )
+        settings = {"type": Path, "metavar": metavar} | settings
+        action = self.add_argument(*flags, **settings)
         self._outputs.append(Output(flags[0], action.dest, kind))
         self.set_defaults(outputs=self._outputs)
 
@@ -99,7 +79,7 @@ class Parser(argparse.ArgumentParser):
         name: str,
         metavar: str,
         text: str,
-        **settings: Unpack[Settings],
+        **settings: Any,
     ) -> None:
         """Add an argument or option that names a file or folder to read.
 
@@ -122,7 +102,7 @@ class Parser(argparse.ArgumentParser):
         name: str,
         metavar: str,
         text: str,
-        **settings: Unpack[Settings],
+        **settings: Any,
     ) -> None:
         """Add an argument or option whose value is a text; `add_path` describes the arguments."""
         self.add_argument(
@@ -138,7 +118,7 @@ class Parser(argparse.ArgumentParser):
         kind: Callable[[str], float],
         metavar: str,
         text: str,
-        **settings: Unpack[Settings],
+        **settings: Any,
     ) -> None:
         """Add an argument or option whose value is a number.
 
@@ -243,11 +223,7 @@ class Parser(argparse.ArgumentParser):
         self.usage = f"%(prog)s {metavar} ..."
         self._passes_words, self._missing = True, missing
 
-    def parse_known_args(
-        self,
-        args: Iterable[str] | None = None,
-        namespace: Any = None,
-    ) -> tuple[Any, list[str]]:
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         words = list(args or ())
         if not self._passes_words:
             self._refuse_unknown(words)
