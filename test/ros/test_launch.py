@@ -212,20 +212,20 @@ def test_the_recording_follows_namespace_and_remaps():
     context.launch_configurations.update(
         {
             "ros_namespace": "/robot1",
-            "ros_remaps": [("stress", "touch")],
+            "ros_remaps": [("stress", "felt")],
             "global_params": [("qos_reliability", "best_effort")],
         }
     )
     action = record_skin(context, "hand", "skin")
     command = [words[0].perform(context) for words in action.cmd]
-    names = ["frequencies", "touch", "compensation", "info", "driver/info", "diagnostics"]
+    names = ["frequencies", "felt", "compensation", "info", "driver/info", "diagnostics"]
     whole = [f"/robot1/hand/{name}" for name in names]
     regex = command[command.index("--regex") + 1]
     others = ["/frequencies", "/diagnostics"]
     assert [name for name in [*whole, *others] if re.search(regex, name)] == whole
     qualities = read_yaml(Path(command[command.index("--qos-profile-overrides-path") + 1]))
     assert list(qualities) == whole
-    assert qualities["/robot1/hand/touch"]["reliability"] == "best_effort"
+    assert qualities["/robot1/hand/felt"]["reliability"] == "best_effort"
     assert qualities["/robot1/hand/info"]["durability"] == "transient_local"
     folder = Path(command[command.index("--output") + 1])
     assert re.fullmatch(r"robot1_hand_skin_\d{4}_\d\d_\d\d-\d\d_\d\d_\d\d", folder.name)
@@ -391,7 +391,7 @@ ROBOT = """
     <set_parameter name="drift_time" value="33"/>
     <set_parameter name="publish_period" value="0.05"/>
     <set_parameter name="rate" value="50.0"/>
-    <set_remap from="stress" to="touch"/>
+    <set_remap from="stress" to="felt"/>
     <include file="$(find-pkg-share cube_tensor_driver)/launch/skin.launch.py">
       <arg name="simulate" value="True"/>
       <arg name="frame_prefix" value="robot1_"/>
@@ -459,7 +459,7 @@ def test_a_robot_includes_a_simulated_skin(ros, tmp_path):
     try:
         driver = int(re.findall(r"pid \[(\d+)\]", wait_for("[driver-3]: process started"))[0])
         wait_for("link hub1: hub 0x2 with 8 cubes of 8 pads")
-        heard = ros.listen(SkinStress, "/robot1/hand/touch", 100)
+        heard = ros.listen(SkinStress, "/robot1/hand/felt", 100)
         ros.wait(lambda: len(heard) > 20)
         assert heard[-1].header.frame_id == "robot1_skin_base"
         os.kill(driver, signal.SIGKILL)
@@ -494,7 +494,7 @@ def test_a_robot_includes_a_simulated_skin(ros, tmp_path):
         assert source.skin.frame(source.skin.cubes[0]) == "robot1_skin_c00"
     with Bag(folder) as bag:
         recorded = {connection.topic for connection in bag.connections}
-    names = ("frequencies", "touch", "compensation", "info", "driver/info", "diagnostics")
+    names = ("frequencies", "felt", "compensation", "info", "driver/info", "diagnostics")
     assert recorded == {f"/robot1/hand/{name}" for name in names}
     assert not [path for path in temporary.iterdir() if path.name.startswith("cube_")]
 
