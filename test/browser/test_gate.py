@@ -63,7 +63,7 @@ TOKEN = "a-token"
 
 @pytest.fixture(params=["", TOKEN])
 def port(request: pytest.FixtureRequest) -> Iterator[int]:
-    """Of a gate with the token, or without one, before viser."""
+    """Return a gate before viser, with the token or without one."""
     address = make_secret_address()
     server = viser.ViserServer(address, 0, verbose=False)
     gate = Gate(HERE, 0, request.param, (address, server.get_port()))
