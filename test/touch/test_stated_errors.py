@@ -20,7 +20,12 @@ from cube_tensor_driver.simulation.motion import read_weight
 from cube_tensor_driver.touch.contact_finder import ContactSettings, make_contact_finder
 from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
 
-SIDE, PITCH, G = 5, 12e-3, 9.81
+SIDE = 5
+"""Number of cubes along each side of the skin."""
+PITCH = 12e-3
+"""Distance of neighbouring cubes in m."""
+G = 9.81
+"""Acceleration of gravity in m/s²."""
 ELASTOMER = Elastomer(depth=5.5e-3, thickness=np.inf)
 
 
