@@ -11,7 +11,8 @@ other machines can reach answers only browsers that were given its token.
 viser (1.1) has no setting for these checks. So viser listens at a secret address of this machine
 (`make_secret_address`) and at a port that the system chooses, and `Gate` listens at the address of
 the page. A page of another site would have to try 2^38 pairs of an address and a port to find
-viser. Other users of this machine could look up its address and port; they are trusted.
+viser, or only the ports on a system such as macOS, which has no secret addresses. Other users of
+this machine could look up address and port; they are trusted.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import hmac
 import http.client
 import io
 import ipaddress
+import logging
 import secrets
 import socket
 import threading
@@ -48,24 +50,30 @@ MAX_HEAD_S = 10.0
 """Maximum time, in seconds, from the beginning of a connection until the head of its request has
 arrived. After this time the connection is closed."""
 
+_log = logging.getLogger(__name__)
+
 _CHUNK_BYTES = 1 << 18
 """Maximum number of bytes that are read at once, from the browser or from viser, and passed on."""
 
 
-def make_secret_address() -> str:
+def make_secret_address(lowest: str = "127.1.0.1") -> str:
     """Return one of 2^23 addresses of this machine (127.x.x.x), chosen at random.
 
-    Raises:
-        ConfigError: The system has no such addresses, as macOS, which has only 127.0.0.1.
+    If the system does not have that address, as macOS, which has only 127.0.0.1, a warning is
+    logged and 127.0.0.1 is returned.
+
+    Args:
+        lowest: Lowest address that may be chosen.
     """
-    address = str(ipaddress.ip_address("127.1.0.1") + secrets.randbelow(1 << 23))
+    address = str(ipaddress.ip_address(lowest) + secrets.randbelow(1 << 23))
     try:
         socket.create_server((address, 0)).close()
-    except OSError as error:
-        raise ConfigError(
-            f"{address}: {error.strerror}; ./cube view needs a system whose loopback addresses are "
-            "all of 127.x.x.x, as Linux"
-        ) from None
+    except OSError:
+        _log.warning(
+            f"this system has no address {address}, so the view is less protected: a web page in "
+            "a browser of this machine that tries all ports of 127.0.0.1 can reach it"
+        )
+        return "127.0.0.1"
     return address
 
 

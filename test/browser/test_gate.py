@@ -139,14 +139,27 @@ def test_the_next_port_is_taken_and_a_silent_browser_does_not_hinder_the_end(cap
     assert not caplog.records
 
 
-def test_viser_itself_listens_at_no_address_that_a_page_could_guess() -> None:
+def test_viser_itself_listens_at_no_address_that_a_page_could_guess(caplog) -> None:
     first, second = make_secret_address(), make_secret_address()
-    assert first != second and HERE not in (first, second)
+    assert not caplog.messages and first != second and HERE not in (first, second)
     server = viser.ViserServer(first, 0, verbose=False)
     for address in (HERE, second):
         with pytest.raises(ConnectionRefusedError):
             socket.create_connection((address, server.get_port()))
     server.stop()
+
+
+def test_a_system_without_secret_addresses_has_the_view_too(caplog) -> None:
+    """No machine has an address of 240.x.x.x, which is reserved, as macOS has none of 127.x.x.x."""
+    address = make_secret_address("240.0.0.1")
+    (warning,) = caplog.messages
+    assert address == HERE and "tries all ports" in warning
+    server = viser.ViserServer(address, 0, verbose=False)
+    gate = Gate(HERE, 0, "", (address, server.get_port()))
+    assert gate.port != server.get_port() and connected(gate.port, f"http://{HERE}:{gate.port}")
+    assert not connected(gate.port, "http://evil.example")
+    server.stop()
+    gate.close()
 
 
 def test_values_that_no_control_offers_do_no_harm() -> None:
