@@ -48,7 +48,7 @@ def repair_bag(path: Path) -> None:
         path: Folder or file of the bag.
     """
     from ..bags.repair import REST_SUFFIX, repair
-    from ..views.terminal.output import say
+    from ..views.terminal.output import format_count, say
 
     done = repair(path)
     print(f"{path}: {done.messages} messages can be read")
@@ -58,7 +58,7 @@ def repair_bag(path: Path) -> None:
             f"{REST_SUFFIX}"
         )
     if done.damaged:
-        say(f"left out {done.damaged} damaged chunks", "red")
+        say(f"left out {format_count(done.damaged, 'damaged record')}", "red")
 
 
 def show_bag(path: Path) -> None:

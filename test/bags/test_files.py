@@ -26,11 +26,13 @@ pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 import pyarrow.csv
 import pyarrow.parquet
 from bag_maker import START_NS, WRENCH, frequencies_of, header, info_of, loads, make_bag, message
+from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
 from conftest import ROOT
 from cube_tensor_driver.bags import summary
+from cube_tensor_driver.bags.mcap_file import RECORD_HEAD
 from cube_tensor_driver.bags.metadata import make_typestore
 from cube_tensor_driver.bags.read import Bag, report_damage
 from cube_tensor_driver.bags.repair import repair
@@ -533,6 +535,20 @@ def test_the_command_that_is_advised_for_a_cut_file_works_on_it(bag, tmp_path, c
     assert "messages can be read" in capsys.readouterr().out
     assert main(["bag", "info", str(cut)]) == 0
     assert main(["bag", "repair", str(tmp_path / "nothing.mcap")]) == 1
+
+
+def test_what_repair_leaves_out_is_counted_by_its_name(copy, capsys):
+    """First one index record of a chunk is damaged, then a second one of another chunk, too."""
+    (path,) = copy.glob("*.mcap")
+    with path.open("rb") as stream:
+        chunks = make_reader(stream).get_summary().chunk_indexes
+    for expected, chunk in (("1 damaged record\n", chunks[0]), ("2 damaged records\n", chunks[-1])):
+        data = bytearray(path.read_bytes())
+        length = min(chunk.message_index_offsets.values()) + RECORD_HEAD.size + 2
+        data[length] ^= 1  # the list is longer than its record
+        path.write_bytes(data)
+        assert main(["bag", "repair", str(copy)]) == 0
+        assert f"left out {expected}" in capsys.readouterr().out
 
 
 def test_a_reprocess_that_failed_does_not_refuse_the_corrected_command(
