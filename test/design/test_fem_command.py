@@ -12,12 +12,14 @@ import shlex
 import signal
 import subprocess
 import sys
+import time
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 pytest.importorskip("skfem", reason="needs skfem: pip install scikit-fem")
 
@@ -397,6 +399,22 @@ def test_control_c_ends_it_quietly(tmp_path):
         output, errors = process.communicate(timeout=60)
     assert process.returncode == 130 and not errors and not output
     assert not list(tmp_path.iterdir())
+
+
+def test_control_c_leaves_no_partial_picture(tmp_path):
+    model, pictures = tmp_path / "small.yaml", tmp_path / "pictures"
+    model.write_text(SMALL)
+    command = cube("fem", model, "--meshes", 1, "--figures", pictures)
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        while process.poll() is None and not list(pictures.glob(".*.part")):
+            time.sleep(0.001)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130 and not errors
+    assert len(list(pictures.iterdir())) < 3
+    for path in pictures.iterdir():
+        with Image.open(path) as picture:
+            picture.load()
 
 
 def test_control_c_in_a_destructor_is_not_lost():
