@@ -10,10 +10,9 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
-from rclpy.client import Client
 from rclpy.node import Node
 
 from ..core.latest_stress import STALE_S
@@ -40,9 +39,31 @@ A process that takes longer is killed.
 """
 
 
+class ServiceResponse(Protocol):
+    """What the responses of all services that the page calls have."""
+
+    success: bool
+    message: str
+
+
+class ServiceFuture(Protocol):
+    """The methods of rclpy's `Future` that are used here; its `result` is None until it is done."""
+
+    def result(self) -> ServiceResponse | None: ...
+    def cancel(self) -> None: ...
+
+
+class ServiceClient(Protocol):
+    """The methods of rclpy's `Client` that are used here. `Client` itself has type arguments since
+    ROS 2 Kilted, and none before."""
+
+    def service_is_ready(self) -> bool: ...
+    def call_async(self, request: object) -> ServiceFuture: ...
+
+
 class _Call(NamedTuple):
     what: str
-    future: Any
+    future: ServiceFuture
     asked_s: float
     notes_success: bool
 
@@ -57,7 +78,7 @@ class ServiceCalls:
     def ask(
         self,
         what: str,
-        client: Client,
+        client: ServiceClient,
         request: object,
         notes_success: bool = True,
     ) -> None:
@@ -90,8 +111,8 @@ class ServiceCalls:
         """
         still_open = []
         for call in self._open:
-            if call.future.done():
-                answer = call.future.result()
+            answer = call.future.result()
+            if answer is not None:
                 if not answer.success:
                     text = f"nothing was changed: {answer.message}"
                     self._say(f"{call.what} refused", text, "red")
@@ -126,7 +147,7 @@ class ReplayClient:
         self.state: ReplayState | None = None
         self._services = services
         self._say = say
-        self._client = node.create_client(SteerReplay, "player/steer")
+        self._client: ServiceClient = node.create_client(SteerReplay, "player/steer")
         node.create_subscription(
             ReplayState,
             "player/state",

@@ -41,7 +41,7 @@ from ..ros.skin_subscriber import FollowedSkin, SkinSubscriber
 from ..srv import Tare
 from . import markup
 from .charts import HISTORY_S
-from .clients import BagRecorder, ReplayClient, ServiceCalls
+from .clients import BagRecorder, ReplayClient, ServiceCalls, ServiceClient
 from .gate import LOCAL_HOSTS, Gate, make_secret_address
 from .history import History
 from .markup import PageStatus
@@ -158,8 +158,8 @@ class Viewer:
         self._replay = ReplayClient(node, self._services, self._status.say)
         self._recorder = BagRecorder(recordings, self._status.say)
         ask = self._services.ask
-        tare = node.create_client(Tare, "reconstruction/tare")
-        clear_tare = node.create_client(Trigger, "reconstruction/clear_tare")
+        tare: ServiceClient = node.create_client(Tare, "reconstruction/tare")
+        clear_tare: ServiceClient = node.create_client(Trigger, "reconstruction/clear_tare")
         # What is done for each action of a user; the arguments are those of `Act`.
         self._commands: dict[str, Callable[..., None]] = {
             TARE: partial(ask, "tare", tare, Tare.Request()),

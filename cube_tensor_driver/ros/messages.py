@@ -115,7 +115,7 @@ class CheckedSubscription:
 
     def _decode(self, data: bytes) -> None:
         try:
-            message = deserialize_message(data, self._kind)
+            message: Any = deserialize_message(data, self._kind)
         # rclpy raises RMWError, which derives from RuntimeError, if the bytes cannot be decoded.
         except RuntimeError as error:
             self._pause.reset()

@@ -238,7 +238,7 @@ class CubeNode(LifecycleNode):
     def create_timer(
         self,
         timer_period_sec: float,
-        callback: Callback,
+        callback: Any,
         *others: Any,
         **options: Any,
     ) -> Any:

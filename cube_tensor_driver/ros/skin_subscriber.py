@@ -217,7 +217,7 @@ class SkinSubscriberNode(CubeNode):
         )
         self.call_at_cleanup(subscriber.close)
         topic = self.get_name()
-        publisher = self.own(
+        publisher: Publisher = self.own(
             self.create_lifecycle_publisher(self._message_type, topic, self._depth)
         )
 

@@ -14,6 +14,7 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
+from rclpy.client import Client
 from std_srvs.srv import Trigger
 
 from cube_tensor_driver.config.skin import Skin
@@ -121,7 +122,7 @@ class Actions:
         self._on_driver_killed = on_driver_killed
         self._is_late = False
         self._begin_ns = 0
-        make_client = observer.node.create_client
+        make_client: Callable[..., Client] = observer.node.create_client
         self._states = {
             name: make_client(ChangeState, f"{name}/change_state")
             for name in ("driver", "reconstruction")

@@ -15,6 +15,7 @@ from rcl_interfaces.srv import (
     ListParameters,
     SetParameters,
 )
+from rclpy.client import Client
 from rclpy.executors import Executor
 from rclpy.parameter import get_parameter_value, parameter_value_to_python
 from std_srvs.srv import Trigger
@@ -323,7 +324,7 @@ def call_service(
         CubeError: The service was not found within `MAX_DISCOVERY_S`, or no response has come
             within `MAX_ANSWER_S`.
     """
-    client = session.node.create_client(service_type, name)
+    client: Client = session.node.create_client(service_type, name)
     try:
         if not discover(session.executor, client.service_is_ready):
             raise CubeError(f"{name}: nobody offers this service in {describe_domain()}")

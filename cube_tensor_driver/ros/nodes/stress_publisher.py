@@ -373,7 +373,7 @@ class _CubePublishers:
     def _announce(self, topics: set[str]) -> None:
         for topic in sorted(topics):
             cube = self._unannounced.pop(topic)
-            publisher = self._node.create_publisher(
+            publisher: Publisher = self._node.create_publisher(
                 self._message_type,
                 topic,
                 CUBE_TOPIC_DEPTH,
