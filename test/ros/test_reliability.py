@@ -315,8 +315,13 @@ PLAIN = {"view", "recorder", "player"}
 
 def test_the_security_policy_allows_what_the_nodes_do(stage, tmp_path):
     """Each topic and service of each node, as SROS 2 names them, and nothing that no node has."""
-    for name in ("markers", "contacts"):
-        stage.children.start(Process(name, f"cube_tensor_driver.ros.nodes.{name}"))
+    poses = tmp_path / "poses.yaml"
+    poses.write_text("poses: [[0, 0, 0, 0, 0, 0, 0]]")
+    motion = {"config": SINGLE, "imperfections": poses, "port_directory": tmp_path / "ports"}
+    for name, parameters in (("markers", {}), ("contacts", {}), ("simulated_imu", motion)):
+        module = f"cube_tensor_driver.ros.nodes.{name}"
+        given = {key: str(value) for key, value in parameters.items()}
+        stage.children.start(Process(name, module, parameters=given))
     bag = str(ROOT / "test" / "data" / "bag")
     for name, *arguments in (
         ("view", "view", "--port", str(free_port())),
@@ -343,6 +348,7 @@ def test_the_security_policy_allows_what_the_nodes_do(stage, tmp_path):
         "reconstruction",
         "markers",
         "contacts",
+        "simulated_imu",
         "view",
         "recorder",
         "player",
