@@ -169,6 +169,7 @@ def check_pads(body: Body, layout: Layout) -> None:
         apart = layout.positions[i] - layout.positions[j]
         distance = np.abs(apart).max()
         is_same_face = np.array_equal(layout.normals[i], layout.normals[j])
+        is_same_face &= not layout.is_dummy[i]
         if is_same_face and distance < size * (1 - 1e-9):
             raise ElasticError(
                 f"pads {layout.pads[i]} and {layout.pads[j]} overlap: {mm * size:g} mm wide, "
@@ -229,7 +230,8 @@ def _pad_edges(layout: Layout) -> Array:
     side of the cube)."""
     half = layout.pad_size / 2
     edges = []
-    for position, normal in zip(layout.positions, layout.normals, strict=True):
+    on_face = ~layout.is_dummy
+    for position, normal in zip(layout.positions[on_face], layout.normals[on_face], strict=True):
         for axis in choose_field_axes(layout):
             if normal[axis] == 0:
                 edges += [

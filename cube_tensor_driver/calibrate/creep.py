@@ -21,6 +21,7 @@ Source: J. D. Ferry, Viscoelastic Properties of Polymers (1980), 4.A and 11.F.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -166,8 +167,8 @@ def fit_recorded_creep(
         name: Name of the cube; None: the only one.
 
     Returns:
-        The fit; and the recorded calibration with the law, and with gains from which the creep that
-        they contain is removed.
+        The fit, without dummy pads; and the recorded calibration with the law, and with gains from
+        which the creep that they contain is removed.
 
     Raises:
         BagError: There is no such bag or cube.
@@ -191,10 +192,18 @@ def fit_recorded_creep(
     known = temperature[is_complete] if np.isfinite(temperature).all() else None
     reading = measured_stress(current, frequency[is_complete], known)
     seconds = (stamp_ns - stamp_ns[:1]) / SECOND
-    pads = calibration.layout.pads
-    result = fit_creep(seconds, reading, calibration.noise, pads)
+    is_loaded = ~calibration.layout.is_dummy
+    pads = tuple(itertools.compress(calibration.layout.pads, is_loaded))
+    result = fit_creep(seconds, reading[:, is_loaded], calibration.noise[is_loaded], pads)
     origin = f"{calibration.source}; creep fitted to {path.name}"
-    fitted = add_creep(calibration, result.model)
+    # The amplitudes of dummy pads are 0.
+    to_all = np.eye(n_pads)[:, is_loaded]
+    model = replace(
+        result.model,
+        amplitude=to_all @ result.model.amplitude,
+        deviation=to_all @ np.asarray(result.model.deviation),
+    )
+    fitted = add_creep(calibration, model)
     return result, replace(fitted, source=origin)
 
 

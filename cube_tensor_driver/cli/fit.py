@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -253,10 +254,11 @@ def run_creep(options: argparse.Namespace) -> None:
     at_once, *later = (compute_step_reading(result.model, time) for time in (1.0, 600.0, 3600.0))
     growth = [[f"{percent:.2f}" for percent in 100 * (one / at_once - 1)] for one in later]
     loads = [f"{load:.0f}" for load in result.load]
+    pads = itertools.compress(calibration.layout.pads, ~calibration.layout.is_dummy)
     print_table(
         ("pad",),
         ("load, Pa", "creep from 1 s to 10 min, %", "to 1 h, %"),
-        list(zip(calibration.layout.pads, loads, *growth, strict=True)),
+        list(zip(pads, loads, *growth, strict=True)),
     )
     say(
         f"{len(result.model.time)} relaxation times explain a hold of {result.hold_s:.0f} s to "

@@ -34,7 +34,7 @@ AnyArray = NDArray[Any]
 
 
 def pad_table(
-    values: Sequence[Array],
+    values: Sequence[Array | Mask],
     n_pads: int,
     fill: float,
 ) -> Array:

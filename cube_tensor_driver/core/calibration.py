@@ -29,6 +29,12 @@ SCHEMA = 1
 MAX_UID = 2**64 - 1
 """Largest unique id of a cube, because a hub sends the id in 8 bytes."""
 
+MAX_DRIFT = 0.01
+"""Largest standard deviation of the common drift of the pads, relative to their frequencies.
+
+With a larger one, stresses that the drift resembles would count as not measured.
+"""
+
 PAD_QUANTITIES = ("rest_frequency", "noise", "modulus", "gain", "beta")
 """Names of the attributes of a calibration that have one value per pad: frequency without load,
 noise, modulus of the foam, gain, and beta (ratio of parasitic to active capacitance)."""
@@ -66,6 +72,9 @@ class Calibration:
         weight: Response of the pads to weight and inertia, if it is known.
         creep: Creep of the elastomer at each pad, if it is known.
         thermal: Reading of each pad over temperature without load, if it is known.
+        drift: Standard deviation of the drift that the frequencies of all pads have in common since
+            the last tare, divided by the frequency. If it is given, dummy pads measure this drift,
+            and it is a part of the stated errors. None: drift is not taken into account.
         neglect: Names of modes whose amplitude is assumed to be zero. The pads then determine more
             of the other modes.
         uid: Unique id of the cube. None means that the calibration holds for any cube.
@@ -91,6 +100,7 @@ class Calibration:
     weight: WeightModel | None = None
     creep: CreepModel | None = None
     thermal: ThermalModel | None = None
+    drift: float | None = None
     neglect: tuple[str, ...] = ()
     uid: int | None = None
     created: str = ""
@@ -102,6 +112,12 @@ class Calibration:
         self._set("half_side", _read_number(self.half_side, "half_side"))
         if self.half_side <= 0:
             raise CalibrationError(f"half_side is {self.half_side} m; it must be above 0")
+        if self.drift is not None:
+            self._set("drift", _read_number(self.drift, "drift"))
+            if not 0 < self.drift <= MAX_DRIFT:
+                raise CalibrationError(
+                    f"drift is {self.drift}; it must be above 0 and at most {MAX_DRIFT}"
+                )
         try:
             structure = self.structure
             self.modes.index(self.neglect)
@@ -234,6 +250,12 @@ class Calibration:
         result: Array = self.gain[:, None] * matrix
         result.flags.writeable = False
         return result
+
+    @property
+    def drift_stress(self) -> Array:
+        """Stress that one standard deviation of the common drift seems to cause (P,), in Pa."""
+        stress: Array = (self.drift or 0.0) * self.modulus * (1 + self.beta)
+        return stress
 
     @property
     def component_scale(self) -> Array:

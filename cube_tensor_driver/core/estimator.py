@@ -1,22 +1,24 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Inversion of a response by weighted least squares, and the residual that shows broken pads.
+"""Inversion of a response by generalised least squares, and the residual that shows broken pads.
 
 The pads measure the stresses v = A s, where A is the response (pads x modes) and the state s holds
 the amplitudes of the modes. The estimated quantities are:
 
-    components    H W v,   H = T (W A)^+
+    components    H W v,   H = T (D W A)^+ D
     covariance    H H'
-    chi-square    |N' W v|^2
+    chi-square    |N' D W v|^2
 
     W             diag(1 / noise)
+    D             (1 + W c (W c)')^(-1/2), where c are the stresses on the pads by one standard
+                  deviation of a drift that all pads have in common
     T             matrix from a state to components, see Modes.components
-    (W A)^+       pseudo-inverse of W A
+    (D W A)^+     pseudo-inverse of D W A
     N             its columns are an orthonormal basis of the vectors that are orthogonal to all
-                  columns of W A; their number is the number of degrees of freedom
+                  columns of D W A; their number is the number of degrees of freedom
 
-A column of W A counts as a combination of the other columns if what remains after subtracting such
-a combination is shorter than `RANK_TOLERANCE` times the longest column.
+A column of D W A counts as a combination of the other columns if what remains after subtracting
+such a combination is shorter than `RANK_TOLERANCE` times the longest column.
 
 Source: Kiyota & Shinoda, eqs. 2 to 5, are the closed forms for one layout; docs/physics.md corrects
 their eqs. 4 and 5.
@@ -78,8 +80,8 @@ class Estimator:
         matrix: Map (T, P) from pad stresses to targets. Rows of targets that the pads do not
             determine are NaN, columns of pads that are left out are 0.
         observed: Whether the pads determine each target (T,).
-        covariance: Covariance of the targets (T, T), NaN in the rows and columns of targets that
-            the pads do not determine.
+        covariance: Covariance of the targets by the noise of the pads (T, T), NaN in the rows and
+            columns of targets that the pads do not determine.
         null: Map (D, P) from pad stresses to D combinations that only noise makes differ from 0,
             each with the standard deviation 1. Chi-square is the sum of their squares.
         limit: Chi-square that noise alone exceeds with probability `FALSE_ALARM`; NaN if there are
@@ -154,8 +156,9 @@ def make_estimator(
     missing: Sequence[int] | Index = (),
     neglect: Sequence[str] = (),
     targets: Array | None = None,
+    drift: Array | float = 0.0,
 ) -> Estimator:
-    """Construct the estimator of a response.
+    """Construct the estimator of a response, by generalised least squares.
 
     Args:
         response: Response (P, M), in Pa per Pa.
@@ -166,6 +169,8 @@ def make_estimator(
             these modes count as not observed.
         targets: Map (T, M) from a state (amplitudes of the modes) to the quantities to estimate; by
             default the 15 components of stress and gradient.
+        drift: Stress on each pad, in Pa, by one standard deviation of a drift that all pads have in
+            common (P,).
     """
     if targets is None:
         targets = modes.components
@@ -176,13 +181,17 @@ def make_estimator(
     present = np.setdiff1d(all_pads, np.asarray(missing, dtype=int))
     kept = np.setdiff1d(all_modes, modes.index(neglect))
 
-    # Dividing by the noise (standard deviation) of each pad gives all pads the standard deviation
-    # 1, so that the sum of the squared residuals is chi-square.
+    # The stresses on the pads divided by the noise (standard deviation) of each pad, and multiplied
+    # by the matrix D (`decorrelate`), are uncorrelated and have the standard deviation 1, so that
+    # the sum of the squared residuals is chi-square.
+    common = np.broadcast_to(drift, n_pads)[present] / noise[present]
+    growth = np.sqrt(1 + (common**2).sum())
+    decorrelate = np.eye(len(present)) - np.outer(common, common) / (growth + growth**2)
     used_response = response[np.ix_(present, kept)]
-    whitened = used_response / noise[present, None]
+    whitened = multiply(decorrelate, used_response / noise[present, None])
     seen = _orthonormalise(whitened, len(present), RANK_TOLERANCE)
     rank = seen.shape[1]
-    # The response divided by the noise is Q R, with orthonormal columns Q. The rows of R are
+    # The whitened response is Q R, with orthonormal columns Q. The rows of R are
     # orthonormalised to V', and the same operations on the rows of Q' yield G. V G is then the
     # pseudo-inverse of Q R.
     reduced = multiply(seen.T, whitened)
@@ -203,9 +212,9 @@ def make_estimator(
     size = np.linalg.norm(targets, axis=1)
     observed = (size > 0) & (unseen + neglected <= LEAK_TOLERANCE * size)
 
-    # `half` maps pad stresses divided by their noise to targets. Those stresses have the variance
-    # 1, so half half' is the covariance of the targets.
-    half = multiply(on_seen, g)
+    # `half` maps pad stresses divided by their noise to targets. The noise of those stresses has
+    # the variance 1, so half half' is the covariance of the targets by noise.
+    half = multiply(multiply(on_seen, g), decorrelate)
     matrix = np.zeros((n_targets, n_pads))
     matrix[:, present] = half / noise[present]
     matrix[~observed] = np.nan
@@ -219,7 +228,7 @@ def make_estimator(
     unexplained = np.eye(n_present) - explained
     null = np.zeros((n_present - rank, n_pads))
     residual = _orthonormalise(unexplained, n_present, count=len(null))
-    null[:, present] = residual.T / noise[present]
+    null[:, present] = multiply(residual.T, decorrelate) / noise[present]
     return Estimator(
         matrix=matrix,
         observed=observed,

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from .arguments import read_numbers
-from .arrays import Array
+from .arrays import Array, Mask
 from .errors import LayoutError
 
 AXES = "xyz"
@@ -45,16 +45,20 @@ It is far above the rounding error of decimal numbers in a file, and far below a
 class Layout:
     """The pads of one kind of cube.
 
+    A dummy pad is an oscillator whose capacitor does not change under a load. It only measures the
+    drift that the oscillators of the cube have in common. Its position and its normal are 0.
+
     Attributes:
         name: Name that calibration and configuration files use.
         positions: Centres of the P pads (P, 3), relative to the centre of the cube, in units of d0
             (half the side of the cube).
         normals: Outward normals of the faces that carry the pads (P, 3), each plus or minus one
-            axis.
+            axis; 0 for a dummy pad.
         pad_size: Side of a square pad, in units of d0.
 
     Raises:
-        LayoutError: A pad is not on the face that its normal names, or two pads coincide.
+        LayoutError: A pad is not on the face that its normal names, two pads coincide, or all pads
+            are dummy pads.
     """
 
     name: str
@@ -96,6 +100,8 @@ class Layout:
         object.__setattr__(self, "positions", positions)
         object.__setattr__(self, "normals", normals)
         object.__setattr__(self, "pad_size", pad_size)
+        if self.is_dummy.all():
+            self._refuse("all normals are 0, which is for dummy pads; add pads on faces")
         for number in range(len(positions)):
             self._check_pad(number)
 
@@ -108,9 +114,12 @@ class Layout:
         position = self.positions[number]
         normal = self.normals[number]
         pad = f"pad {number + 1}"
+        if self.is_dummy[number] and not position.any():
+            return
         if sorted(np.abs(normal)) != [0, 0, 1]:
             self._refuse(
-                f"{pad} has normal {normal.tolist()}; a normal is one axis, such as [0, 0, -1]"
+                f"{pad} has normal {normal.tolist()}; a normal is one axis, such as [0, 0, -1], or "
+                "0, like the position, for a dummy pad"
             )
         height = position @ normal
         if abs(height - 1) > TOLERANCE:
@@ -140,17 +149,23 @@ class Layout:
         return len(self.positions)
 
     @cached_property
+    def is_dummy(self) -> Mask:
+        """Whether each pad is a dummy pad (P,)."""
+        is_dummy: Mask = (self.normals == 0).all(axis=1)
+        return is_dummy
+
+    @cached_property
     def pads(self) -> tuple[str, ...]:
         """Names of the pads, such as "+z-x" for the pad on the face +z on the side of -x.
 
-        A second pad on the same side of a face is "+z-x#2". The names do not change if pads are
-        added at the end of the layout.
+        A second pad on the same side of a face is "+z-x#2", and a dummy pad is "dummy". The names
+        do not change if pads are added at the end of the layout.
         """
         names: list[str] = []
         places: list[str] = []
         for position, normal in zip(self.positions, self.normals, strict=True):
             side = position - normal * (position @ normal)
-            place = _name_axes(normal) + _name_axes(side)
+            place = _name_axes(normal) + _name_axes(side) or "dummy"
             earlier = places.count(place)
             places.append(place)
             names.append(f"{place}#{earlier + 1}" if earlier else place)

@@ -104,6 +104,7 @@ def _find_estimator(calibration: Calibration, mask: int) -> Estimator:
         calibration.modes,
         pads[is_missing],
         calibration.neglect,
+        drift=calibration.drift_stress,
     )
     # So far, the estimator gives gradients times d0 (half the side of the cube), in Pa.
     scale = calibration.component_scale

@@ -113,6 +113,8 @@ class Reconstructor:
         )
         # Stress on each pad (cubes, P), in Pa, per relative change of its rest frequency.
         self._stress_per_drift = modulus * (1 + beta)
+        # Standard deviations of the common drift of each cube's pads that the calibrations state.
+        self._stated_drift = np.array([calibration.drift or 0.0 for calibration in calibrations])
 
     def __repr__(self) -> str:
         changes = f"{self.rest_changes} changes of rest frequencies"
@@ -136,6 +138,12 @@ class Reconstructor:
     def rest_frequency(self, value: Array) -> None:
         self.pipeline.rest_frequency = value
         self.health.refresh()
+
+    @property
+    def has_errors(self) -> bool:
+        """Whether stress may have other errors than noise (see `errors`)."""
+        is_drifting = self.drift_time > 0 or bool(self._stated_drift.any())
+        return self.compensation.is_active or is_drifting
 
     @property
     def rest_changes(self) -> int:
@@ -238,9 +246,11 @@ class Reconstructor:
             not determine.
         """
         # The frequencies of all pads of a cube drift by about the same fraction, so the error looks
-        # like a pressure from all sides.
-        drift = self._drift.deviation[cubes, None] * self._stress_per_drift[cubes]
-        on_pads = np.dstack([self.compensation.pad_errors(cubes), drift])
+        # like a pressure from all sides, unless the cube has a dummy pad.
+        drift = np.hypot(self._drift.deviation, self._stated_drift)[cubes, None]
+        on_pads = np.dstack(
+            [self.compensation.pad_errors(cubes), drift * self._stress_per_drift[cubes]]
+        )
         matrices = np.zeros((len(cubes), len(COMPONENTS), on_pads.shape[1]))
         chosen = zip(cubes.tolist(), left_out.tolist(), strict=True)
         for number, (cube, mask) in enumerate(chosen):

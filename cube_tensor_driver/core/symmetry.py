@@ -234,13 +234,14 @@ def find_structure(
 
     letters: dict[str, tuple[str, int]] = {}
     images_of_first = set(pad_images[:, 0])
-    is_one_orbit = len(images_of_first) == layout.n_pads
+    is_one_orbit = len(images_of_first) == np.sum(~layout.is_dummy)
     if is_one_orbit and layout.planar and layout.pads[0] == "+z-x":
         # Kiyota & Shinoda denote the coefficients of pad V1 by letters. The group maps V1 onto
         # every other pad, so the coefficients of the other pads are the same, except for signs.
         letters = _PAPER_LETTERS if "xz" in modes.names else _LETTERS
 
     is_assigned = np.zeros((layout.n_pads, modes.n_modes), dtype=bool)
+    is_assigned[layout.is_dummy] = True  # a dummy pad responds to no mode
     members: list[tuple[str, Array]] = []
     for pad, mode in np.ndindex(is_assigned.shape):
         if is_assigned[pad, mode]:

@@ -17,6 +17,7 @@ import pytest
 pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 
 from bag_maker import START_NS, info_of
+from dummy_pad import with_dummy
 
 from conftest import encoded
 from cube_tensor_driver.bags.metadata import make_typestore, quality
@@ -40,10 +41,10 @@ PRESS = np.array([-8e3, 0, -20e3, 0, 2e3, 0])
 """Stress under the press, in Pa, order xx yy zz yz zx xy."""
 
 
-def measured(time, scale, growth, exponent=0.2, seed=0):
+def measured(time, scale, growth, exponent=0.2, seed=0, base=PLAIN):
     """Frequencies (N, P) of a cube under `scale` (N,) times `PRESS`, in Hz."""
     creep = Imperfections(creep_growth=growth, creep_exponent=exponent, creep_spread=0.2, seed=seed)
-    cubes = SimulatedCubes([PLAIN], PadErrors(None, imperfections=creep), seed=seed)
+    cubes = SimulatedCubes([base], PadErrors(None, imperfections=creep), seed=seed)
     gradient = np.zeros((1, 6, 3))
     found = [
         cubes.frequency(PRESS[None] * s, gradient, t) for t, s in zip(time, scale, strict=True)
@@ -71,9 +72,9 @@ def held_times(hold):
     return np.concatenate([np.arange(0, 5, 0.25), 5 + change, middle, 5 + hold + change])
 
 
-def reconstructed(time, scale, growth, exponent=0.2, seed=0, calibration=None):
+def reconstructed(time, scale, growth, exponent=0.2, seed=0, calibration=None, base=PLAIN):
     """Error of zz at each time, in Pa, and its stated deviation at the last one."""
-    frequency = measured(time, scale, growth, exponent, seed)
+    frequency = measured(time, scale, growth, exponent, seed, base)
     calibration = calibration or add_creep(PLAIN, fitted(growth, exponent, seed).model)
     reconstruct = Reconstructor([calibration])
     stamp_ns = 10**9 + np.rint(1e9 * time).astype(np.int64)
@@ -169,17 +170,18 @@ def test_presses_that_come_and_go_or_miss_a_pad_are_refused():
         fit_creep(time, uneven, np.ones(8), PLAIN.layout.pads)
 
 
-def test_three_commands_lead_from_a_bag_to_a_calibration(tmp_path, capsys):
+@pytest.mark.parametrize("base", [PLAIN, with_dummy("planar")])
+def test_three_commands_lead_from_a_bag_to_a_calibration(tmp_path, capsys, base):
     """The law of the bag is in the file, and a press that is no hold is one line with the fix."""
     time = np.arange(0, 100, 0.1)
-    frequency = measured(time, pressed(time, 5, 90), 0.1)
-    cube = SimpleNamespace(name="c0", link="hub0", index=0, uid=0, calibration=PLAIN)
+    frequency = measured(time, pressed(time, 5, 90), 0.1, base=base)
+    cube = SimpleNamespace(name="c0", link="hub0", index=0, uid=0, calibration=base)
     skin = SimpleNamespace(name="skin", elastomer=None, frame=lambda cube: cube.name, cubes=[cube])
     bag, saved = tmp_path / "press", tmp_path / "mine.yaml"
     with BagWriter(bag) as writer:
         for name, kind in {"info": INFO, "frequencies": FREQUENCIES}.items():
             writer.add_topic(f"/{name}", kind, [quality(latched=name == "info")])
-        info = info_of(skin, Pipeline([PLAIN]), START_NS)
+        info = info_of(skin, Pipeline([base]), START_NS)
         writer.write("/info", START_NS, bytes(make_typestore().serialize_cdr(info, INFO)))
         for n, pads in enumerate(frequency.astype(np.float32)):
             stamp_ns = START_NS + n * 100_000_000
@@ -190,7 +192,8 @@ def test_three_commands_lead_from_a_bag_to_a_calibration(tmp_path, capsys):
     assert "relaxation times explain a hold of 85 s to 0.0" in capsys.readouterr().out
     assert saved.with_suffix(".png").stat().st_size > 20_000
     found = read_calibration(saved)
-    error, _ = reconstructed(time, pressed(time, 5, 90), 0.1, calibration=found)
+    assert found.creep.amplitude[:8].any(axis=1).all() and not found.creep.amplitude[8:].any()
+    error, _ = reconstructed(time, pressed(time, 5, 90), 0.1, calibration=found, base=base)
     assert np.abs(error[60:880]).max() / 200 < 0.3
     assert cli.main(["fit", "--creep", str(bag), "--cube", "c9", "-o", str(saved)]) == 1
     assert "no cube 'c9'; there are c0" in capsys.readouterr().err

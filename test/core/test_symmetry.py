@@ -115,6 +115,8 @@ def test_a_layout_survives_plain_types():
     "change, words",
     [
         ({"normals": [[0, 0, 2]]}, "normal"),
+        ({"positions": [[0, 0, 1], [0, 0, 1]], "normals": [[0, 0, 1], [0, 0, 0]]}, "dummy pad"),
+        ({"positions": [[0, 0, 0]], "normals": [[0, 0, 0]]}, "add pads on faces"),
         ({"positions": [[0, 0, 0.9]]}, "not on the face"),
         ({"positions": [[0.9, 0, 1]]}, "face ends at 1"),
         ({"positions": [[0, 0, 1], [0, 0, 1]], "normals": [[0, 0, 1], [0, 0, 1]]}, "coincide"),

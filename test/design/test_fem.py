@@ -31,7 +31,7 @@ from cube_tensor_design.fem.volume_loads import (
 from cube_tensor_design.paper.virtual_bench import VirtualBench
 from cube_tensor_driver.config.calibration import read_calibration
 from cube_tensor_driver.core.errors import ElasticError
-from cube_tensor_driver.core.layout import LAYOUTS
+from cube_tensor_driver.core.layout import LAYOUTS, Layout
 from cube_tensor_driver.core.modes import PLANE
 from cube_tensor_driver.core.response import project
 
@@ -268,6 +268,17 @@ def test_elastic_steel_is_as_good_as_rigid():
     rigid = compute_response(Body(cube_young=RIGID), HALVES, meshes=1).matrix
     steel = compute_response(Body(), HALVES, meshes=1).matrix
     assert 0 < np.abs(rigid - steel).max() < 5e-6  # E / E_cube = 1.5e-6
+
+
+def test_dummy_pads_change_no_other_pad():
+    own = strip_layout(LAYOUTS["planar"], 0.6)
+    zeros = np.zeros((2, 3))
+    positions, normals = (np.vstack([one, zeros]) for one in (own.positions, own.normals))
+    layout = Layout("mine", positions, normals, own.pad_size)
+    found, plain = (
+        compute_response(Body(cube_young=RIGID), one, meshes=1).matrix for one in (layout, own)
+    )
+    np.testing.assert_allclose(found, np.vstack([plain, np.zeros((2, 7))]), atol=1e-12)
 
 
 def test_plane_stress_is_plane_strain_of_another_ratio():

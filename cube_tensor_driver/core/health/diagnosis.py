@@ -177,13 +177,15 @@ class PadDiagnosis:
             (cubes, P), in Hz².
     """
 
-    def __init__(self, exists: Mask) -> None:
+    def __init__(self, exists: Mask, is_dummy: Mask) -> None:
         """Prepare the diagnosis of the pads of a skin.
 
         Args:
             exists: Whether each cube has each pad (cubes, P), with P the largest number of pads.
+            is_dummy: Whether it is a dummy pad, whose frequency no load changes (cubes, P).
         """
         self._exists = exists
+        self._is_dummy = is_dummy
         self.still: Mask = np.zeros(len(exists), bool)
         # Mean frequencies in the window in which the cube came to rest; NaN while it moves.
         self._mean_at_rest = np.full(exists.shape, np.nan)
@@ -226,6 +228,8 @@ class PadDiagnosis:
                 state,
             )
             found[self._find_drifting(window)] |= DRIFT
+        # Under a slow load, a dummy pad seems to be stuck, or to drift relative to the others.
+        found[self._is_dummy] &= NOISY
         is_valid = has_enough_rows[:, None] & self._exists
         return found * is_valid
 

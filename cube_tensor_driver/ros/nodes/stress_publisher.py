@@ -132,7 +132,8 @@ class ErrorPublisher:
     """Publishes `stress_errors`: how uncertain the newest stress is for other reasons than noise.
 
     The message contains the result of `Reconstructor.errors` for all cubes. It is published only
-    while something is compensated or drift is tracked, and while the topic has subscribers.
+    while something is compensated, or drift is tracked or stated in a calibration, and while the
+    topic has subscribers.
     """
 
     def __init__(self, node: CubeNode, reconstructor: Reconstructor) -> None:
@@ -153,8 +154,7 @@ class ErrorPublisher:
             stamp_ns: Stamp of their message, in ns since the Unix epoch.
         """
         reconstructor = self._reconstructor
-        has_errors = reconstructor.compensation.is_active or reconstructor.drift_time
-        if not has_errors or not self._publisher.get_subscription_count():
+        if not reconstructor.has_errors or not self._publisher.get_subscription_count():
             return
         self._left_out[rows.cube] = rows.left_out
         is_uncertain = self._is_uncertain.copy()

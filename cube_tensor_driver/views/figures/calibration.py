@@ -45,6 +45,8 @@ def draw_layout(layout: Layout) -> Figure:
         layout.normals,
         strict=True,
     ):
+        if not normal.any():
+            continue  # a dummy pad is on no face
         _draw_pad(
             axes,
             name,
