@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import TypedDict, cast
 
 import numpy as np
 
@@ -23,6 +23,18 @@ the box around the centres of its cubes has the diagonal 0."""
 LEGEND_HEIGHT = 0.8
 """Height (along y) of the legend that the node `markers` draws beside the skin, divided by the
 width of the skin (along x)."""
+
+
+_Display = TypedDict("_Display", {"Name": str, "Topic": dict[str, str]})
+_Camera = TypedDict("_Camera", {"Focal Point": dict[str, float], "Distance": float})
+_Manager = TypedDict(
+    "_Manager",
+    {
+        "Global Options": dict[str, str],
+        "Displays": list[_Display],
+        "Views": dict[str, _Camera],
+    },
+)
 
 
 def make_rviz_view(skin: Skin) -> dict[str, object]:
@@ -47,8 +59,8 @@ def make_rviz_view(skin: Skin) -> dict[str, object]:
     focal_point = (low + high) / 2
 
     content = read_yaml(find_package_data() / "rviz" / "skin.rviz")
-    view = cast("dict[str, Any]", content)
-    manager = view["Visualization Manager"]
+    view = cast("dict[str, object]", content)
+    manager = cast(_Manager, view["Visualization Manager"])
     manager["Global Options"]["Fixed Frame"] = skin.parent_frame
     displays = {display["Name"]: display for display in manager["Displays"]}
     displays["Wrench"]["Topic"]["Value"] = f"cubes/{central_cube.name}/wrench"

@@ -11,7 +11,7 @@ import json
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 
@@ -100,6 +100,32 @@ class FaultRecord:
     fault: Fault
 
 
+class _LinkContent(TypedDict):
+    """A `LinkLog` in JSON."""
+
+    name: str
+    cubes: list[int]
+    dropped: int
+    runs: list[dict[str, int]]
+    damaged: list[tuple[int, int]]
+
+
+class _FaultContent(TypedDict):
+    """A `FaultRecord` in JSON; `Fault.parse` checks its fault."""
+
+    start_us: int
+    end_us: int
+    fault: object
+
+
+class _LogContent(TypedDict):
+    """A `SampleLog` in JSON."""
+
+    start_time_ns: int
+    links: list[_LinkContent]
+    faults: list[_FaultContent]
+
+
 @dataclass(frozen=True)
 class SampleLog:
     """Samples of all hubs of a skin, and their faults.
@@ -141,20 +167,23 @@ class SampleLog:
             raise ConfigError(f"{path}: no sample log of this version ({error!r})") from None
 
     @classmethod
-    def _parse(cls, data: dict[str, Any]) -> SampleLog:
+    def _parse(cls, data: _LogContent) -> SampleLog:
         """Create a log from the dictionary that its JSON file contains."""
-        links = []
-        for link in data["links"]:
-            tuples = {
-                "cubes": tuple(link["cubes"]),
-                "runs": tuple(SampleRun(**run) for run in link["runs"]),
-                "damaged": tuple(map(tuple, link["damaged"])),
-            }
-            links.append(LinkLog(**link | tuples))
-        faults = tuple(
-            FaultRecord(**record | {"fault": Fault(**record["fault"])}) for record in data["faults"]
+        links = tuple(
+            LinkLog(
+                name=link["name"],
+                cubes=tuple(link["cubes"]),
+                dropped=link["dropped"],
+                runs=tuple(SampleRun(**run) for run in link["runs"]),
+                damaged=tuple((boot, number) for boot, number in link["damaged"]),
+            )
+            for link in data["links"]
         )
-        return cls(data["start_time_ns"], tuple(links), faults)
+        faults = tuple(
+            FaultRecord(one["start_us"], one["end_us"], Fault.parse(one["fault"], "fault"))
+            for one in data["faults"]
+        )
+        return cls(data["start_time_ns"], links, faults)
 
     @property
     def dropped(self) -> int:
