@@ -22,12 +22,12 @@ DEFAULT_MESHES = 3
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_argument(
+    parser.add_value(
         "model",
-        nargs="?",
-        metavar="MODEL",
-        help="YAML file of geometry and material, or the name of a shipped one in config/fem "
+        "MODEL",
+        "YAML file of geometry and material, or the name of a shipped one in config/fem "
         "(default: a planar steel cube of 4 mm in a section of 60 x 11 mm)",
+        nargs="?",
     )
     parser.add_argument(
         "--load",

@@ -51,7 +51,7 @@ completely and 1 if it explains nothing.
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_text("port", "PORT", "device path, or socket://host:port")
+    parser.add_value("port", "PORT", "device path, or socket://host:port")
     parser.add_output(
         "-o",
         "--output",
@@ -64,7 +64,7 @@ def add_arguments(parser: Parser) -> None:
         default="skin",
         help="name of the skin (default: %(default)s)",
     )
-    parser.add_text(
+    parser.add_value(
         "--calibration",
         "FILE",
         "calibration file or name (default: the shipped one for the number of pads)",

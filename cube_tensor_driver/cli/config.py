@@ -16,33 +16,17 @@ from .parser import Parser, count, positive
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
     grid = parser.add_subcommand("grid", "write the skin file of a flat grid of cubes")
-    grid.add_number(
-        "--nx",
-        count,
-        "N",
-        "cubes along x",
-        required=True,
-    )
-    grid.add_number(
-        "--ny",
-        count,
-        "N",
-        "cubes along y",
-        required=True,
-    )
-    grid.add_number(
+    grid.add_value("--nx", "N", "cubes along x", count, required=True)
+    grid.add_value("--ny", "N", "cubes along y", count, required=True)
+    grid.add_value(
         "--pitch",
-        positive,
         "M",
         "distance from cube to cube, m (default: %(default)s)",
+        positive,
         default=DEFAULT_PITCH,
     )
-    grid.add_number(
-        "--links",
-        count,
-        "N",
-        "hubs that share the cubes (default: %(default)s)",
-        default=1,
+    grid.add_value(
+        "--links", "N", "hubs that share the cubes (default: %(default)s)", count, default=1
     )
     grid.add_rate()
     grid.add_argument(
@@ -55,13 +39,10 @@ def add_arguments(parser: Parser) -> None:
         default="/dev/ttyACM{}",
         help="ports; {} is the number of the link (default: %(default)s)",
     )
-    grid.add_text(
-        "--layout",
-        "NAME",
-        "layout of the cubes (default: %(default)s)",
-        default="planar",
+    grid.add_value(
+        "--layout", "NAME", "layout of the cubes (default: %(default)s)", default="planar"
     )
-    grid.add_text(
+    grid.add_value(
         "--calibration",
         "FILE",
         "calibration file or name (default: that of the package for the layout)",
@@ -74,7 +55,7 @@ def add_arguments(parser: Parser) -> None:
         help="skin file to write",
     )
     check = parser.add_subcommand("check", "list what is wrong with a skin file, or what it holds")
-    check.add_path("file", "FILE", "skin file")
+    check.add_value("file", "FILE", "skin file", Path)
 
 
 def run(options: argparse.Namespace) -> int:

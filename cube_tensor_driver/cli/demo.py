@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from .parser import Parser, count, not_negative, positive, sample_rate
 
@@ -14,53 +15,46 @@ DEFAULT_DURATION_S = 10.0
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_path(
-        "--config",
-        "FILE",
-        "skin file to simulate (default: sixteen planar cubes)",
+    parser.add_value(
+        "--config", "FILE", "skin file to simulate (default: sixteen planar cubes)", Path
     )
-    parser.add_number(
-        "--cubes",
-        count,
-        "N",
-        "simulate a grid of N planar cubes instead",
+    parser.add_value("--cubes", "N", "simulate a grid of N planar cubes instead", count)
+    parser.add_value(
+        "--load", "FILE", "load script (default: a contact that wanders over the skin)", Path
     )
-    parser.add_path(
-        "--load",
-        "FILE",
-        "load script (default: a contact that wanders over the skin)",
-    )
-    parser.add_path(
+    parser.add_value(
         "--mujoco",
         "SCENE",
         "MuJoCo scene (.xml) that touches the skin, instead of a load script; it names its "
         "skin file itself (docs/simulation.md; scenes: config/mujoco)",
+        Path,
     )
-    parser.add_number(
+    parser.add_value(
         "--rate",
-        sample_rate,
         "HZ",
         "samples per second (default: those of the skin file, else 100)",
+        sample_rate,
     )
-    parser.add_number(
+    parser.add_value(
         "--noise",
-        not_negative,
         "X",
         "noise of the pads relative to their frequencies, 0 for none "
         "(default: as the calibrations state)",
+        not_negative,
     )
-    parser.add_path(
+    parser.add_value(
         "--imperfections",
         "FILE",
         "how pads differ from their calibrations: gains, dead pads, creep, temperature, and weight "
         "in a moving skin (docs/simulation.md; default: not at all)",
+        Path,
     )
-    parser.add_number(
+    parser.add_value(
         "--duration",
-        positive,
         "S",
         "end after S seconds and print the figures (default: until Ctrl-C; "
         f"{DEFAULT_DURATION_S:g} with --headless, --json or --figure)",
+        positive,
     )
     parser.add_switch("--headless", "show no live table")
     parser.add_switch("--view", "show the skin in the browser too, as ./cube view does")

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_text("topic", "TOPIC", "as in stress or cubes/c05/stress")
+    parser.add_value("topic", "TOPIC", "as in stress or cubes/c05/stress")
     parser.add_switch("--once", "end after the first message")
     parser.add_switch("--json", "print one JSON object per line")
 

@@ -33,42 +33,25 @@ def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
     lerobot = parser.add_subcommand("lerobot", "one LeRobot data set (v3.0) of all bags")
     _add_common(lerobot)
-    lerobot.add_number(
-        "--fps",
-        count,
-        "N",
-        "frames per second of the data set",
-        required=True,
-    )
-    lerobot.add_text(
-        "--task",
-        "TEXT",
-        "what was done (default: %(default)s)",
-        default="touch",
-    )
-    lerobot.add_text(
+    lerobot.add_value("--fps", "N", "frames per second of the data set", count, required=True)
+    lerobot.add_value("--task", "TEXT", "what was done (default: %(default)s)", default="touch")
+    lerobot.add_value(
         "--marks",
         "TOPIC",
         "topic of texts (std_msgs/String): each begins an episode with this task, an empty "
         "one only ends it (default: each bag is one episode)",
     )
-    lerobot.add_text(
+    lerobot.add_value(
         "--topics",
         "T",
         "other topics to add: images and numbers with a stamp (default: all)",
         nargs="*",
     )
-    lerobot.add_text(
-        "--state",
-        "TOPIC",
-        "topic of observation.state (default: the only topic of joint states)",
+    lerobot.add_value(
+        "--state", "TOPIC", "topic of observation.state (default: the only topic of joint states)"
     )
-    lerobot.add_text("--action", "TOPIC", "topic of action (default: none)")
-    lerobot.add_text(
-        "--frequencies",
-        "TOPIC",
-        "frequencies to export, of several skins in a bag",
-    )
+    lerobot.add_value("--action", "TOPIC", "topic of action (default: none)")
+    lerobot.add_value("--frequencies", "TOPIC", "frequencies to export, of several skins in a bag")
     for name, text in TABLES.items():
         table = parser.add_subcommand(name, text)
         _add_common(table)

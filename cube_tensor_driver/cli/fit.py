@@ -29,46 +29,41 @@ FIGURES = (
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_path(
+    parser.add_value(
         "loads",
         "LOADS",
         "CSV with columns of pads (Hz) and of modes (Pa) or fx fy fz (N); or a bag",
+        Path,
         nargs="?",
     )
-    parser.add_text(
-        "--reference",
-        "TOPIC",
-        "topic of the bag to fit to: WrenchStamped (with --area) or stress",
+    parser.add_value(
+        "--reference", "TOPIC", "topic of the bag to fit to: WrenchStamped (with --area) or stress"
     )
-    parser.add_text(
-        "--cube",
-        "NAME",
-        "cube of the bag, if there are several in it",
-    )
-    parser.add_text("--layout", "NAME", "quad, planar, cube, or a YAML file")
-    parser.add_path(
+    parser.add_value("--cube", "NAME", "cube of the bag, if there are several in it")
+    parser.add_value("--layout", "NAME", "quad, planar, cube, or a YAML file")
+    parser.add_value(
         "--weight",
         "BAG",
         "instead of a table, fit the response to weight and inertia to a bag in which an "
         "unloaded arm is turned through a few poses",
+        Path,
     )
-    parser.add_path(
+    parser.add_value(
         "--creep",
         "BAG",
         "instead of a table, fit the creep of the foam to a bag with one press that is held",
+        Path,
     )
-    parser.add_path(
+    parser.add_value(
         "--rest",
         "BAG",
         "instead of a table, fit the pads' drift and thermal stress over temperature to bags "
         "in which the unloaded skin warms or cools; several cubes become -o FILE_CUBE.yaml",
+        Path,
         nargs="+",
     )
-    parser.add_text(
-        "--symmetry",
-        "G",
-        "full, slab, mirrors or none (default: %(default)s)",
-        default="full",
+    parser.add_value(
+        "--symmetry", "G", "full, slab, mirrors or none (default: %(default)s)", default="full"
     )
     parser.add_output(
         "-o",
@@ -77,23 +72,13 @@ def add_arguments(parser: Parser) -> None:
         required=True,
         help="calibration file to write",
     )
-    parser.add_text(
+    parser.add_value(
         "--base",
         "FILE",
         "calibration that gives beta, modulus and half side (default: the shipped one)",
     )
-    parser.add_number(
-        "--area",
-        positive,
-        "M2",
-        "area that fx fy fz act on, square metres",
-    )
-    parser.add_number(
-        "--uid",
-        uid,
-        "UID",
-        "uid of the only cube that the calibration is for",
-    )
+    parser.add_value("--area", "M2", "area that fx fy fz act on, square metres", positive)
+    parser.add_value("--uid", "UID", "uid of the only cube that the calibration is for", uid)
     parser.add_output(
         "--figure",
         kind="picture",

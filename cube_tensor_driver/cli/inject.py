@@ -5,23 +5,22 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from .parser import Parser
 
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_text(
+    parser.add_value(
         "fault",
         "KEY=VALUE",
         "kind=... and what it needs, as in kind=unplug link=hub0 seconds=2; "
         "docs/reliability.md lists them",
         nargs="+",
     )
-    parser.add_path(
-        "--ports",
-        "DIR",
-        "folder of the simulated ports (default: that of the newest demo)",
+    parser.add_value(
+        "--ports", "DIR", "folder of the simulated ports (default: that of the newest demo)", Path
     )
 
 

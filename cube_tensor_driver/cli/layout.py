@@ -17,20 +17,12 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_text(
-        "name",
-        "NAME",
-        "quad, planar, cube, or a YAML file with a layout",
+    parser.add_value("name", "NAME", "quad, planar, cube, or a YAML file with a layout")
+    parser.add_value(
+        "--symmetry", "G", "full, slab, mirrors or none (default: that of the calibration)"
     )
-    parser.add_text(
-        "--symmetry",
-        "G",
-        "full, slab, mirrors or none (default: that of the calibration)",
-    )
-    parser.add_text(
-        "--calibration",
-        "FILE",
-        "calibration file or name (default: the computed one)",
+    parser.add_value(
+        "--calibration", "FILE", "calibration file or name (default: the computed one)"
     )
     parser.add_json()
     parser.add_output(

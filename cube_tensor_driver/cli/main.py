@@ -19,7 +19,7 @@ import threading
 from collections.abc import Sequence
 
 from ..processes.stop_signals import INTERRUPTED
-from .parser import Parser, check_outputs, columns, make_sentence, suggest_nearest
+from .parser import Parser, check_outputs, columns, make_formatter, make_sentence, suggest_nearest
 from .table import COMMANDS, GROUPS, PACKAGES
 
 PROGRAM = "./cube"
@@ -120,7 +120,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     if words[0] == "--version":
         print(f"cube_tensor_driver {find_version()}")
         raise SystemExit(0)
-    return make_command_parser(words[0]).parse_args(words[1:])
+    return make_command_parser(words[0]).parse(words[1:])
 
 
 def make_command_parser(name: str) -> Parser:
@@ -152,7 +152,11 @@ def make_command_parser(name: str) -> Parser:
         Parser(prog=PROGRAM).error(
             f"the command {name} is not part of the driver: run it as ./cube {name} in a checkout"
         )
-    parser = Parser(prog=f"{PROGRAM} {name}", description=make_sentence(COMMANDS[name]))
+    parser = Parser(
+        prog=f"{PROGRAM} {name}",
+        description=make_sentence(COMMANDS[name]),
+        formatter_class=make_formatter,
+    )
     module.add_arguments(parser)
     parser.set_defaults(run=module.run)
     return parser

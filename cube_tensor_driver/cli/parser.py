@@ -12,7 +12,7 @@ import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import NoReturn, TypeVar
 
 Number = TypeVar("Number", int, float)
 
@@ -39,103 +39,69 @@ class Output:
 class Parser(argparse.ArgumentParser):
     """An ArgumentParser with error messages of two lines, which suggest similar known words."""
 
-    # The methods pass their further arguments to argparse, which annotates them with Any.
-    def __init__(self, **settings: Any) -> None:
-        self._flags: list[str] = []
-        self._outputs: list[Output] = []
-        self._subcommands: argparse._SubParsersAction[Parser] | None = None
-        self._passes_words = False
-        self._missing = ""
-        settings.setdefault("formatter_class", make_formatter)
-        super().__init__(**settings)
-
-    def add_argument(self, *flags: str, **settings: Any) -> argparse.Action:
-        action = super().add_argument(*flags, **settings)
-        self._flags += action.option_strings
-        return action
+    _subcommands: argparse._SubParsersAction[Parser] | None = None
+    _passes_words = False
+    _missing = ""
 
     def add_output(
         self,
         *flags: str,
+        help: str,
         kind: str = "file",
-        **settings: Any,
+        required: bool = False,
+        default: Path | Callable[[argparse.Namespace], Path] | None = None,
     ) -> None:
-        """Add an option or argument that names a file or folder to write.
+        """Add an option that names a file or folder to write.
 
         Args:
             flags: Names of the option.
+            help: Help text.
             kind: Kind of the output, see `Output`.
-            settings: Further arguments of `add_argument`. The default may be a function that
-                computes the path from the parsed options.
+            required: Whether the option must be given.
+            default: Path, or a function that computes it from the parsed options.
         """
-        metavar = "DIR" if kind == "folder" else "FILE"
-        settings = {"type": Path, "metavar": metavar} | settings
-        action = self.add_argument(*flags, **settings)
-        self._outputs.append(Output(flags[0], action.dest, kind))
-        self.set_defaults(outputs=self._outputs)
-
-    def add_path(
-        self,
-        name: str,
-        metavar: str,
-        text: str,
-        **settings: Any,
-    ) -> None:
-        """Add an argument or option that names a file or folder to read.
-
-        Args:
-            name: Name of the argument or option.
-            metavar: Name of its value in the help text.
-            text: Help text.
-            settings: Further arguments of `add_argument`.
-        """
-        self.add_argument(
-            name,
+        action = self.add_argument(
+            *flags,
             type=Path,
-            metavar=metavar,
-            help=text,
-            **settings,
+            metavar="DIR" if kind == "folder" else "FILE",
+            help=help,
+            required=required,
+            default=default,
         )
+        earlier = self.get_default("outputs") or ()
+        self.set_defaults(outputs=(*earlier, Output(flags[0], action.dest, kind)))
 
-    def add_text(
+    def add_value(
         self,
         name: str,
         metavar: str,
         text: str,
-        **settings: Any,
+        kind: Callable[[str], object] = str,
+        *,
+        nargs: str | None = None,
+        default: object = None,
+        required: bool = False,
     ) -> None:
-        """Add an argument or option whose value is a text; `add_path` describes the arguments."""
-        self.add_argument(
-            name,
-            metavar=metavar,
-            help=text,
-            **settings,
-        )
-
-    def add_number(
-        self,
-        name: str,
-        kind: Callable[[str], float],
-        metavar: str,
-        text: str,
-        **settings: Any,
-    ) -> None:
-        """Add an argument or option whose value is a number.
+        """Add an argument or option with a value.
 
         Args:
             name: Name of the argument or option.
-            kind: Function that converts a text and checks the range, such as `positive`.
             metavar: Name of its value in the help text.
             text: Help text.
-            settings: Further arguments of `add_argument`.
+            kind: Function that converts a text into the value and checks it, such as `positive`.
+            nargs: "?" for at most one value, "*" or "+" for several; None for one.
+            default: Value if it is not given.
+            required: Whether an option must be given.
         """
-        self.add_argument(
+        action = self.add_argument(
             name,
             type=kind,
             metavar=metavar,
             help=text,
-            **settings,
+            nargs=nargs,
+            default=default,
         )
+        action.required |= required
 
     def add_switch(self, flag: str, text: str) -> None:
         """Add an option without a value, which is true if it is given; `text` is its help text."""
@@ -147,33 +113,23 @@ class Parser(argparse.ArgumentParser):
 
     def add_bag(self) -> None:
         """Add the argument BAG, a bag (recording) to read."""
-        self.add_path("bag", "BAG", "folder or file of the bag")
+        self.add_value("bag", "BAG", "folder or file of the bag", Path)
 
     def add_bags(self) -> None:
         """Add the argument BAG ..., several bags to read."""
-        self.add_path(
-            "bags",
-            "BAG",
-            "folders or files of bags",
-            nargs="+",
-        )
+        self.add_value("bags", "BAG", "folders or files of bags", Path, nargs="+")
 
     def add_jobs(self) -> None:
         """Add the option --jobs N, the number of processes that work at the same time."""
-        self.add_number(
-            "--jobs",
-            count,
-            "N",
-            "number of processes (default: one per core)",
-        )
+        self.add_value("--jobs", "N", "number of processes (default: one per core)", count)
 
     def add_rate(self) -> None:
         """Add the option --rate HZ, the sample rate in a skin file."""
-        self.add_number(
+        self.add_value(
             "--rate",
-            sample_rate,
             "HZ",
             "samples per second (default: %(default)g)",
+            sample_rate,
             default=100.0,
         )
 
@@ -192,12 +148,12 @@ class Parser(argparse.ArgumentParser):
                 metavar="WHAT",
                 required=True,
             )
-        added: Parser = self._subcommands.add_parser(
+        return self._subcommands.add_parser(
             name,
             help=text,
             description=make_sentence(text),
+            formatter_class=make_formatter,
         )
-        return added
 
     def add_words(
         self,
@@ -214,29 +170,28 @@ class Parser(argparse.ArgumentParser):
             text: Help text about the words.
             missing: Error message if no word follows; empty if none is needed.
         """
-        self.add_text(
-            "words",
-            metavar,
-            text,
-            nargs=argparse.REMAINDER,
-        )
+        self.add_value("words", metavar, text, nargs=argparse.REMAINDER)
         self.usage = f"%(prog)s {metavar} ..."
         self._passes_words, self._missing = True, missing
 
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        words = list(args or ())
+    def parse(self, words: list[str]) -> argparse.Namespace:
+        """Parse the words that follow the command.
+
+        Raises:
+            SystemExit: Help was printed, or the words are wrong.
+        """
         if not self._passes_words:
             self._refuse_unknown(words)
-            return super().parse_known_args(words, namespace)
+            return self.parse_args(words)
         if words[:1] in (["-h"], ["--help"]):
             self.print_help()
             self.exit()
         # argparse itself does not report a missing word: it returns an empty list.
         if self._missing and not words:
             self.exit(2, f"{self._make_prefix()}{self._missing}\n")
-        namespace, _ = super().parse_known_args([], namespace)
-        namespace.words = words
-        return namespace, []
+        options = self.parse_args([])
+        options.words = words
+        return options
 
     def _refuse_unknown(self, words: list[str]) -> None:
         """Report unknown subcommands and options before argparse parses them.
@@ -254,20 +209,24 @@ class Parser(argparse.ArgumentParser):
                 self.error(f"one of these has to follow: {', '.join(known)}")
             if word is not None and word not in known:
                 self.error(f"unknown command {word}; {suggest_nearest(word, known)}")
+            if word is not None:
+                following = words[words.index(word) + 1 :]
+                self._subcommands.choices[word]._refuse_unknown(following)
             return
+        flags = self._option_string_actions
         for word in words:
             if word == "--":
                 break
             flag = word.partition("=")[0]
             if flag.startswith("--"):
-                fits = any(known.startswith(flag) for known in self._flags)
+                fits = any(known.startswith(flag) for known in flags)
             # A word such as -5 is a negative number and no option.
             elif flag[:1] == "-" and flag[1:2].isalpha():
-                fits = flag[:2] in self._flags
+                fits = flag[:2] in flags
             else:
                 continue
             if not fits:
-                self.error(f"unknown option {flag}; {suggest_nearest(flag, self._flags)}")
+                self.error(f"unknown option {flag}; {suggest_nearest(flag, flags)}")
 
     def error(self, message: str) -> NoReturn:
         """Print an error message and the command that prints the help, and exit with code 2."""

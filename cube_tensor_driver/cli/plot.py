@@ -13,20 +13,20 @@ from .parser import Parser, number
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
     parser.add_bag()
-    parser.add_text("--cube", "NAME", "which cube (default: the first)")
-    parser.add_number(
+    parser.add_value("--cube", "NAME", "which cube (default: the first)")
+    parser.add_argument(
         "--from",
-        number,
-        "S",
-        "begin S seconds after the start of the bag",
+        type=number,
+        metavar="S",
+        help="begin S seconds after the start of the bag",
         dest="start",
         default=0.0,
     )
-    parser.add_number(
+    parser.add_argument(
         "--to",
-        number,
-        "S",
-        "end S seconds after the start of the bag",
+        type=number,
+        metavar="S",
+        help="end S seconds after the start of the bag",
         dest="end",
         default=math.inf,
     )

@@ -26,18 +26,15 @@ def add_arguments(parser: Parser) -> None:
         metavar="DIR",
         help="folder of the bag, which must not exist yet",
     )
-    parser.add_text(
+    parser.add_value(
         "--topics",
         "T",
         f"topics to record (default: {' '.join(RECORDED)})",
         nargs="+",
         default=RECORDED,
     )
-    parser.add_number(
-        "--duration",
-        positive,
-        "S",
-        "end S seconds after the first message (default: Ctrl-C)",
+    parser.add_value(
+        "--duration", "S", "end S seconds after the first message (default: Ctrl-C)", positive
     )
     parser.add_argument(
         "--storage",
@@ -45,18 +42,8 @@ def add_arguments(parser: Parser) -> None:
         default="mcap",
         help="format of the files (default: %(default)s)",
     )
-    parser.add_number(
-        "--split-size",
-        positive,
-        "MB",
-        "begin a new file after MB megabytes",
-    )
-    parser.add_number(
-        "--split-time",
-        positive,
-        "S",
-        "begin a new file after S seconds",
-    )
+    parser.add_value("--split-size", "MB", "begin a new file after MB megabytes", positive)
+    parser.add_value("--split-time", "S", "begin a new file after S seconds", positive)
 
 
 def run(options: argparse.Namespace) -> int:

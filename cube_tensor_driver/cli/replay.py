@@ -32,19 +32,15 @@ KEYS = "space: pause, s: step, q: quit"
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
     parser.add_bag()
-    parser.add_number(
-        "--rate",
-        positive,
-        "R",
-        "times the recorded speed (default: %(default)g)",
-        default=1.0,
+    parser.add_value(
+        "--rate", "R", "times the recorded speed (default: %(default)g)", positive, default=1.0
     )
     parser.add_switch("--loop", "begin again at the end")
-    parser.add_number(
+    parser.add_value(
         "--start",
-        not_negative,
         "S",
         "begin S seconds after the start of the bag (default: %(default)g)",
+        not_negative,
         default=0.0,
     )
     parser.add_switch("--clock", "publish /clock for nodes with use_sim_time")

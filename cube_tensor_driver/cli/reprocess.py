@@ -56,15 +56,12 @@ def add_overrides(parser: Parser) -> None:
     Args:
         parser: The parser of a command that reprocesses bags.
     """
-    parser.add_text(
-        "--calibration",
-        "FILE",
-        "calibration of all cubes (default: as recorded)",
-    )
-    parser.add_path(
+    parser.add_value("--calibration", "FILE", "calibration of all cubes (default: as recorded)")
+    parser.add_value(
         "--skin",
         "FILE",
         "skin file with the calibrations to use, for cubes of the same names",
+        Path,
     )
     parser.add_argument(
         "--tare-from",

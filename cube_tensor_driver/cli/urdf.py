@@ -5,14 +5,15 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from .parser import Parser
 
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_path("file", "FILE", "skin file")
-    parser.add_text(
+    parser.add_value("file", "FILE", "skin file", Path)
+    parser.add_value(
         "--frame-prefix",
         "TEXT",
         "text in front of all frame ids, as in the launch file's frame_prefix:=left_",

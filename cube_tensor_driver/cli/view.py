@@ -16,31 +16,32 @@ RECORDINGS = Path("~/cube_recordings")
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_text(
+    parser.add_value(
         "--host",
         "ADDRESS",
         "where the page is served; on any other than this machine's own (0.0.0.0: on all) "
         "browsers need the token in the printed address (default: %(default)s)",
         default="127.0.0.1",
     )
-    parser.add_number(
+    parser.add_value(
         "--port",
-        tcp_port,
         "N",
         "TCP port of the page; the next free one if it is taken (default: %(default)s)",
+        tcp_port,
         default=8080,
     )
-    parser.add_number(
+    parser.add_value(
         "--depth",
-        positive,
         "M",
         "depth of the cubes below the surface, m (default: %(default)s)",
+        positive,
         default=SURFACE_DEPTH,
     )
-    parser.add_path(
+    parser.add_value(
         "--recordings",
         "DIR",
         "folder for the bags that are recorded from the page (default: %(default)s)",
+        Path,
         default=RECORDINGS,
     )
 

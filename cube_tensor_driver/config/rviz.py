@@ -25,7 +25,13 @@ LEGEND_HEIGHT = 0.8
 width of the skin (along x)."""
 
 
-_Display = TypedDict("_Display", {"Name": str, "Topic": dict[str, str]})
+class _Display(TypedDict):
+    """Keys of a display in RViz's file that are read or changed here."""
+
+    Name: str
+    Topic: dict[str, str]
+
+
 _Camera = TypedDict("_Camera", {"Focal Point": dict[str, float], "Distance": float})
 _Manager = TypedDict(
     "_Manager",

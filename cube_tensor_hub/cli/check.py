@@ -15,17 +15,9 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_argument(
-        "port",
-        metavar="PORT",
-        help="device path, or socket://host:port",
-    )
-    parser.add_argument(
-        "--baud",
-        type=count,
-        default=921_600,
-        metavar="N",
-        help="rate of a serial port (default: %(default)s)",
+    parser.add_value("port", "PORT", "device path, or socket://host:port")
+    parser.add_value(
+        "--baud", "N", "rate of a serial port (default: %(default)s)", count, default=921_600
     )
     parser.add_json()
     parser.epilog = (

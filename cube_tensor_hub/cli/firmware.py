@@ -32,19 +32,14 @@ def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
     parser.add_subcommand("build", "compile the hubs in C, and print how large one is")
     run = parser.add_subcommand("run", "run the hub of a microcontroller in QEMU, under a load")
-    run.add_argument(
+    run.add_value(
         "--config",
-        type=Path,
-        metavar="FILE",
-        help="skin file of 4 cubes of 8 pads on one TCP link, at whose port the hub appears "
+        "FILE",
+        "skin file of 4 cubes of 8 pads on one TCP link, at whose port the hub appears "
         "(default: skin_firmware.yaml of the package)",
+        Path,
     )
-    run.add_argument(
-        "--load",
-        type=Path,
-        metavar="FILE",
-        help="load script (default: an indenter that wanders)",
-    )
+    run.add_value("--load", "FILE", "load script (default: an indenter that wanders)", Path)
     parser.add_subcommand("test", "run the tests of the firmware")
 
 

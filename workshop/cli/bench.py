@@ -63,13 +63,13 @@ def add_arguments(parser: Parser) -> None:
         "skin for growing numbers of cubes, with a picture",
         timed=True,
     )
-    scale.add_argument(
+    scale.add_value(
         "--counts",
-        type=count,
+        "N",
+        f"numbers of cubes (default: {' '.join(map(str, DEFAULT_COUNTS))})",
+        count,
         nargs="+",
         default=DEFAULT_COUNTS,
-        metavar="N",
-        help=f"numbers of cubes (default: {' '.join(map(str, DEFAULT_COUNTS))})",
     )
     scale.add_output(
         "--figure",
@@ -89,12 +89,8 @@ def add_arguments(parser: Parser) -> None:
     )
     for chain in (skin, touch, contacts):
         _add_chain(chain)
-    contacts.add_argument(
-        "--loads",
-        type=count,
-        default=10,
-        metavar="N",
-        help="number of loads of each shape (default: %(default)s)",
+    contacts.add_value(
+        "--loads", "N", "number of loads of each shape (default: %(default)s)", count, default=10
     )
     contacts.add_output(
         "--figure",
@@ -124,44 +120,32 @@ def _add(
     """
     benchmark = parser.add_subcommand(name, text)
     if cubes is not None:
-        benchmark.add_argument(
-            "--cubes",
-            type=count,
-            default=cubes,
-            metavar="N",
-            help="number of cubes (default: %(default)s)",
+        benchmark.add_value(
+            "--cubes", "N", "number of cubes (default: %(default)s)", count, default=cubes
         )
     if timed:
-        benchmark.add_argument(
-            "--rate",
-            type=sample_rate,
-            default=rate,
-            metavar="HZ",
-            help="scans per second (default: %(default)g)",
+        benchmark.add_value(
+            "--rate", "HZ", "scans per second (default: %(default)g)", sample_rate, default=rate
         )
-        benchmark.add_argument(
+        benchmark.add_value(
             "--duration",
-            type=positive,
+            "S",
+            "how long to measure, s (default: %(default)g)",
+            positive,
             default=10.0,
-            metavar="S",
-            help="how long to measure, s (default: %(default)g)",
         )
     benchmark.add_json()
     return benchmark
 
 
 def _add_chain(parser: Parser) -> None:
-    parser.add_argument(
-        "--composed",
-        action="store_true",
-        help="run driver and reconstruction in one process",
-    )
-    parser.add_argument(
+    parser.add_switch("--composed", "run driver and reconstruction in one process")
+    parser.add_value(
         "--publish-period",
-        type=not_negative,
+        "S",
+        "time that one message covers, s; 0: one message per scan (default: %(default)g)",
+        not_negative,
         default=0.0,
-        metavar="S",
-        help="time that one message covers, s; 0: one message per scan (default: %(default)g)",
     )
     parser.add_argument(
         "--pads",

@@ -11,24 +11,20 @@ from cube_tensor_driver.cli.parser import Parser, positive, whole_number
 
 def add_arguments(parser: Parser) -> None:
     """Add duration, seed and mutation."""
-    parser.add_argument(
+    parser.add_value(
         "--duration",
-        type=positive,
+        "S",
+        "how long faults are injected, s (default: %(default)g)",
+        positive,
         default=60.0,
-        metavar="S",
-        help="how long faults are injected, s (default: %(default)g)",
     )
-    parser.add_argument(
-        "--seed",
-        type=whole_number,
-        default=0,
-        metavar="N",
-        help="seed of the random mix (default: %(default)s)",
+    parser.add_value(
+        "--seed", "N", "seed of the random mix (default: %(default)s)", whole_number, default=0
     )
-    parser.add_argument(
+    parser.add_value(
         "--mutate",
-        metavar="NAME",
-        help="put a fault into the driver or the reconstruction that must be found; all: one after "
+        "NAME",
+        "put a fault into the driver or the reconstruction that must be found; all: one after "
         "the other, each in a short torture of its own",
     )
     parser.add_json()
