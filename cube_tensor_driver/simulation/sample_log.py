@@ -110,7 +110,7 @@ class _LinkContent(TypedDict):
     damaged: list[tuple[int, int]]
 
 
-class _FaultContent(TypedDict):
+class _FaultRecordContent(TypedDict):
     """A `FaultRecord` in JSON; `Fault.parse` checks its fault."""
 
     start_us: int
@@ -123,7 +123,7 @@ class _LogContent(TypedDict):
 
     start_time_ns: int
     links: list[_LinkContent]
-    faults: list[_FaultContent]
+    faults: list[_FaultRecordContent]
 
 
 @dataclass(frozen=True)
