@@ -120,7 +120,12 @@ class BagSource:
             count,
         )
 
-    def read_segments(self, *, use_health: bool = False) -> Iterator[Segment]:
+    def read_segments(
+        self,
+        *,
+        use_health: bool = False,
+        join: bool = True,
+    ) -> Iterator[Segment]:
         """Yield all messages in the order of recording, with their rows (samples of cubes).
 
         Each segment has successive messages with the same cubes, SkinInfo (calibrations and rest
@@ -128,6 +133,7 @@ class BagSource:
 
         Args:
             use_health: Whether to read the recorded health of the pads, too.
+            join: Whether a segment may have several messages.
 
         Raises:
             BagError: The bag is damaged.
@@ -136,13 +142,14 @@ class BagSource:
             # The health is read before messages are divided, because the recorded stress was
             # decoded in the same groups.
             health = self.recording.health.at(messages.rows) if use_health else None
-            yield from self._divide(messages, recorded_ns, health)
+            yield from self._divide(messages, recorded_ns, health, join)
 
     def _divide(
         self,
         messages: Decoded[FrequencyRows],
         recorded_ns: Times,
         health: RecordedHealth | None,
+        join: bool,
     ) -> Iterator[Segment]:
         """Divide successive messages of frequencies into segments.
 
@@ -150,6 +157,7 @@ class BagSource:
             messages: M messages of frequencies.
             recorded_ns: (M,) time at which each was recorded, in ns since the Unix epoch.
             health: Recorded health of the pads for their rows, or None.
+            join: Whether a segment may have several messages.
         """
         n_rows = len(messages.rows) // len(messages)
         cube = messages.group_by_message(messages.rows.cube)
@@ -164,7 +172,7 @@ class BagSource:
             # So messages are joined only if the index does not rise from the last row of a message
             # to the first row of the next one: otherwise two scans would become one.
             order = cube[begin]
-            can_join = len(order) and order[0] <= order[-1]
+            can_join = join and len(order) and order[0] <= order[-1]
             step = end - begin if can_join else 1
             for first in range(begin, end, step):
                 chosen = slice(first, first + step)

@@ -19,6 +19,7 @@ from ..core.arrays import Index
 from ..core.errors import CubeError, MessageError
 from ..core.latest_stress import STALE_S, LatestStress
 from ..core.poses import CubePoses
+from ..core.rate_limit import find_next_due_ns
 from ..core.rows import StressRows
 from ..messages.codec import stress_codec
 from ..messages.skin_info import describe_geometry, read_cube_poses
@@ -170,7 +171,8 @@ class SkinSubscriberNode(CubeNode):
 
         A timer calls it `rate` times per second. If the subclass overrides `follow_stress`, too,
         there is no timer: it is called when a `stress` message arrives, but on average at most
-        `rate` times per second. If it returns None, nothing is published.
+        `rate` times per second by the stamps of these messages, as in reprocessing. If it returns
+        None, nothing is published.
 
         Args:
             skin: The state of the skin.
@@ -196,19 +198,17 @@ class SkinSubscriberNode(CubeNode):
     def configure(self) -> None:
         is_followed = type(self).follow_stress is not SkinSubscriberNode.follow_stress
         period_s = 1.0 / self.read_value("rate")
-        due_s = 0.0
+        period_ns = round(1e9 * period_s)
+        due_ns = 0
 
         def receive(stamp_ns: int, rows: StressRows) -> None:
-            nonlocal due_s
-            now_s = subscriber.now()
-            # Messages of stress are not exactly periodic, so one may come half a period too early.
-            # If it comes more than two periods too early, the clock was set back.
-            early_s = due_s - now_s
-            if period_s / 2 < early_s < 2 * period_s:
+            nonlocal due_ns
+            next_ns = find_next_due_ns(stamp_ns, due_ns, period_ns)
+            if next_ns is None:
                 publish(self.follow_stress)
-                return
-            due_s = max(min(due_s, now_s + period_s), now_s) + period_s
-            publish(self.compute_message)
+            else:
+                due_ns = next_ns
+                publish(self.compute_message)
 
         subscriber = SkinSubscriber(
             self,

@@ -191,6 +191,26 @@ def reconstruct(
     Raises:
         BagError: The bag is damaged.
     """
+    for segment, stress, _ in _reconstruct(source, settings):
+        yield segment, stress
+
+
+def _reconstruct(
+    source: BagSource,
+    settings: list[Settings] | None,
+    *,
+    join: bool = True,
+) -> Iterator[tuple[Segment, StressRows, Reconstructor]]:
+    """Compute the stress of a bag as `reconstruct` does.
+
+    Args:
+        source: The recorded frequencies.
+        settings: See `reconstruct`.
+        join: Whether a segment may have several messages, which is faster. The stress is the same.
+
+    Yields:
+        Each segment, its stress, and the reconstructor that has computed it as the last one.
+    """
     recorded = source.recording.settings
     settings = settings or recorded
     # With other settings than the recorded ones, other pads can be faulty, so the health of the
@@ -199,7 +219,7 @@ def reconstruct(
     number = -1
     ids: list[str] = []
     refused: CubeError | None = None
-    for segment in source.read_segments(use_health=use_health):
+    for segment in source.read_segments(use_health=use_health, join=join):
         if segment.number != number:
             number = segment.number
             current = settings[number]
@@ -224,7 +244,7 @@ def reconstruct(
             refused = error
             source.skip(segment, error)
             continue
-        yield segment, stress
+        yield segment, stress, reconstructor
     if refused is not None and not source.messages:
         raise BagError(f"{source.bag.path}: {source.topic}: {refused}")
 
@@ -300,7 +320,9 @@ def _write_skin(
         from .contacts import ContactWriter
 
         contacts = ContactWriter(writer, skin, job.contacts)
-    for segment, stress in reconstruct(source, settings):
+    # The state of the compensation after each message decides how uncertain its contacts are.
+    join = contacts is None
+    for segment, stress, reconstructor in _reconstruct(source, settings, join=join):
         messages = segment.messages
         encoded = stress_codec.encode(
             stress,
@@ -311,8 +333,8 @@ def _write_skin(
         for time_ns, data in zip(times_ns, encoded, strict=True):
             writer.write(f"{skin}stress", time_ns, data)
         if contacts is not None:
-            contacts.set_up(infos[segment.number])
-            contacts.write(stress, messages, segment.recorded_ns)
+            contacts.set_up(infos[segment.number], reconstructor)
+            contacts.write(stress, int(messages.stamp_ns[0]), times_ns[0])
 
 
 def _recalibrate(

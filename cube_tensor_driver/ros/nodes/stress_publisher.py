@@ -24,9 +24,10 @@ from ...core.arrays import Array
 from ...core.forces import Forces
 from ...core.reconstructor import Reconstructor
 from ...core.rows import FrequencyRows, StressRows
-from ...core.status import COMPENSATION, INVALID
+from ...core.status import INVALID
+from ...core.stress_errors import StressErrors
 from ...core.tensor import contact_wrench
-from ...messages.codec import SECOND, stress_codec
+from ...messages.codec import stress_codec
 from ...messages.point_cloud import make_cloud_message
 from ...msg import SkinStress, StressTensorStamped
 from ..messages import make_message, make_tensor_message, make_wrench_message, pack_array, to_time
@@ -51,11 +52,6 @@ CUBE_TOPIC_DEPTH = 10
 FORCE_FIELDS = ("x", "y", "z", "fx", "fy", "fz")
 """Names of the float32 fields of a point in the point cloud `forces`: position of the cube, in m,
 and force on it, in N, both in the parent frame of the skin."""
-
-
-ERRORS_PERIOD_NS = SECOND // 2
-"""Longest time, in ns, between two messages of `stress_errors`. A message comes earlier if the
-compensation of a cube becomes uncertain (status bit COMPENSATION)."""
 
 
 class StressPublisher:
@@ -137,35 +133,23 @@ class ErrorPublisher:
     """
 
     def __init__(self, node: CubeNode, reconstructor: Reconstructor) -> None:
-        self._reconstructor = reconstructor
+        self._errors = StressErrors(reconstructor)
         self._publisher = node.own(
             node.create_lifecycle_publisher(Float32MultiArray, "stress_errors", 2)
         )
-        self._cubes = np.arange(len(reconstructor.names))
-        self._left_out = np.zeros(len(self._cubes), np.uint32)
-        self._is_uncertain = np.zeros(len(self._cubes), bool)
-        self._last_ns = 0
 
     def publish(self, rows: StressRows, stamp_ns: int) -> None:
-        """Publish the errors if they are due (`ERRORS_PERIOD_NS`).
+        """Publish the errors if they are due, see `StressErrors`.
 
         Args:
             rows: Rows of stress, one cube at one sampling time each.
             stamp_ns: Stamp of their message, in ns since the Unix epoch.
         """
-        reconstructor = self._reconstructor
-        if not reconstructor.has_errors or not self._publisher.get_subscription_count():
+        if not self._publisher.get_subscription_count():
             return
-        self._left_out[rows.cube] = rows.left_out
-        is_uncertain = self._is_uncertain.copy()
-        is_uncertain[rows.cube] = rows.status & COMPENSATION > 0
-        is_worse = is_uncertain & ~self._is_uncertain
-        is_due = abs(stamp_ns - self._last_ns) >= ERRORS_PERIOD_NS or is_worse.any()
-        if not is_due:
+        errors = self._errors.update(rows, stamp_ns)
+        if errors is None:
             return
-        self._last_ns = stamp_ns
-        self._is_uncertain = is_uncertain
-        errors = reconstructor.errors(self._cubes, self._left_out).astype(np.float32)
         message = Float32MultiArray(data=pack_array("f", errors))
         labels = "cube", "component", "cause"
         for axis, (label, size) in enumerate(zip(labels, errors.shape, strict=True)):
