@@ -303,7 +303,7 @@ class _InverseFinder:
         else:
             certain = CERTAIN_DEVIATIONS * self._inverse.error_deviation
         self.contacts = self._tracker.update(values, certain)
-        self._slip.adopt(self.contacts, values)
+        self._slip.adopt(self.contacts, values, self._tracker.single_fits)
         self._slip.update(time_s, values)
         self.touch_id = self._links.link(self.contacts, touches)
 

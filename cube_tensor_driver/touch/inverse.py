@@ -285,6 +285,12 @@ class SurfaceInverse:
         """
         return np.asarray(values)[:, self.columns] * self._unit_factors
 
+    def select(self, components: Array) -> Array:
+        """Return the C components `columns` (..., C) of all 15 (..., 15), without a copy if all."""
+        if len(self.columns) == components.shape[-1]:
+            return components
+        return np.asarray(components[..., self.columns])
+
     def unroll(self, centre: int, cubes: Index | slice) -> tuple[Array, Array]:
         """Lay cubes of a bent skin flat around one cube, from which they keep their distance.
 

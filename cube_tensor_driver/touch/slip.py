@@ -34,7 +34,8 @@ Source: K. L. Johnson, Contact Mechanics (1985), 7.1 (sliding) and 7.2 (partial 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -179,6 +180,10 @@ pads. If it is larger, as it is while the shear force has changed little, the me
 (NaN)."""
 
 
+NO_FITS: Mapping[int, HertzFit] = MappingProxyType({})
+"""Fits by the ids of their contacts if none are known."""
+
+
 class Slip(NamedTuple):
     """State and friction of n contacts.
 
@@ -277,15 +282,23 @@ class SlipEstimator:
         ]
         self._contacts: AnyArray = np.zeros(0, fields)
         self._times = np.full(n_scans, -np.inf)
+        self._fits = NO_FITS
         self.slip = NO_CONTACTS
 
-    def adopt(self, found: Sequence[TrackedContact], values: Array) -> None:
+    def adopt(
+        self,
+        found: Sequence[TrackedContact],
+        values: Array,
+        fits: Mapping[int, HertzFit] = NO_FITS,
+    ) -> None:
         """Take over the contacts that the tracker has found; call `update` afterwards.
 
         Args:
             found: The contacts.
             values: Components (cubes, 15) in Pa and Pa/m in which they were found.
+            fits: `ContactTracker.single_fits`, whose derivatives need not be computed again.
         """
+        self._fits = fits
         scaled = self._inverse.scale_values(values)
         ids = self._contacts["id"].tolist()
         contacts = np.zeros(len(found), self._contacts.dtype)
@@ -310,7 +323,11 @@ class SlipEstimator:
             self.slip = NO_CONTACTS
             return
 
-        contacts["partial"] = self._estimate_partial_slip()
+        contacts["partial"] = np.nan
+        # Eight coefficients need as many scans. A contact that moves begins again in every scan.
+        is_determined = contacts["gram"][:, 0, 0] >= 8
+        if is_determined.any():
+            contacts["partial"] = np.where(is_determined, self._estimate_partial_slip(), np.nan)
         normal = contacts["normal"]
         followed = self._follow(scaled)
         before = _compute_motion_states(followed, normal)
@@ -356,6 +373,7 @@ class SlipEstimator:
         scaled = self._inverse.scale_values(values)
         loads = self._follow(scaled)
         self._linearise_changed(loads, scaled)
+        self._fits = NO_FITS  # later, the contacts are elsewhere
         self._observe_shear(scaled)
         newest = _compute_motion_states(loads, contacts["normal"])
         self._remember(time_s, newest)
@@ -605,30 +623,27 @@ class SlipEstimator:
         by_distance = np.argsort(distance)
         cubes = by_distance[:n_cubes]
         home = int(cubes[0])
-        usable = np.where(is_turned_away[:, None], np.nan, scaled)
-        self._noise.update(usable, cubes)
-        local = LocalValues(inverse, self._noise, home, cubes)
-
-        # Derivatives are computed in the frame of `home`, the cube nearest to the contact. Contacts
-        # near this one take part. They are sorted by distance, so that this one comes first.
         rotation = poses.rotation[home]
         apart = _compute_lengths(positions - place)
         is_near = apart < NEIGHBOUR_PITCHES * inverse.pitch
-        n_near = np.sum(is_near)
-        near = np.argsort(apart)[:n_near]
-        forces = loads[near, :3] @ rotation
-        from_home = positions[near] - poses.position[home]
-        centres = from_home @ rotation
-        radii = self._contacts["radius"][near]
-        discs = Discs(forces, centres[:, :2], np.log(radii))
-        fit = HertzFit(inverse, local, discs)
-        linearise(inverse, [fit])
-
-        # The first five parameters of the fit are force (3) and position (2) of this contact.
-        linear = fit.linear
-        solved = linear.covariance[:5] @ linear.jacobian.T
-        solved = solved.reshape(5, len(cubes), -1)
-        weights = np.einsum("knc,ncd->knd", solved, local.whitening)
+        near = np.argsort(apart)[: is_near.sum()]
+        # The tracker has just computed the derivatives for this contact alone.
+        fit = self._fits.get(int(contact["id"]))
+        if fit is None or fit.values.home != home or len(near) > 1:
+            # Derivatives are computed in the frame of `home`, the cube nearest to the contact.
+            # Contacts near this one take part. They are sorted by distance, so that this one comes
+            # first.
+            usable = np.where(is_turned_away[:, None], np.nan, scaled)
+            self._noise.update(usable, cubes)
+            local = LocalValues(inverse, self._noise, home, cubes)
+            forces = loads[near, :3] @ rotation
+            from_home = positions[near] - poses.position[home]
+            centres = from_home @ rotation
+            radii = self._contacts["radius"][near]
+            discs = Discs(forces, centres[:, :2], np.log(radii))
+            fit = HertzFit(inverse, local, discs)
+            linearise(inverse, [fit])
+        weights = fit.compute_weights(cubes)
 
         by_pad = np.nan_to_num(inverse.by_pad[cubes])
         position_weights = weights[3:]

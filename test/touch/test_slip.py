@@ -36,7 +36,7 @@ class Run:
         self.states, self.velocity, self.partial, self.begun = [], [], [], []
         for number, scan in enumerate(values):
             if number % TRACKED_SCANS == 0:
-                self.estimator.adopt(tracker.update(scan), scan)
+                self.estimator.adopt(tracker.update(scan), scan, tracker.single_fits)
             if self.estimator.update(number * PERIOD_S, scan):
                 self.begun.append(number)
             (state,) = self.estimator.slip.state
@@ -171,7 +171,7 @@ def test_time_that_jumps_back_and_contacts_that_come_and_go(benches):
     )
     tracker = ContactTracker(benches[0].inverse, CONTACT_PRESSURE)
     estimator = SlipEstimator(benches[0].inverse)
-    estimator.adopt(tracker.update(here), here)
+    estimator.adopt(tracker.update(here), here, tracker.single_fits)
     for number in range(4):
         assert not estimator.update(9 + number * PERIOD_S, here)
     assert estimator.slip.state.tolist() == [STICK]
@@ -179,3 +179,23 @@ def test_time_that_jumps_back_and_contacts_that_come_and_go(benches):
     assert estimator.slip.state.tolist() == [UNKNOWN]
     estimator.adopt([], here)
     assert not estimator.update(1.1, here) and not len(estimator.slip.state)
+
+
+def test_motion_follows_from_the_derivatives_of_the_tracker_as_from_its_own(benches):
+    random = np.random.default_rng(8)
+    bench, body, skin = benches[0], Body(0.5, 5e-3, True), RubbedSkin(benches[0], random)
+    here, there = (
+        skin.measure(skin.pads(body, 3.0, np.array([0.0, 0.2]), np.array([x, 1e-3]))[None])[0]
+        for x in (2e-3, 2.1e-3)
+    )
+    tracker, moved = ContactTracker(bench.inverse, CONTACT_PRESSURE), []
+    found = tracker.update(here, max_work=np.inf)
+    assert list(tracker.single_fits) == [found[0].id]
+    for fits in ({}, tracker.single_fits):
+        estimator = SlipEstimator(bench.inverse)
+        estimator.adopt(found, here, fits)
+        estimator.update(0.0, here)
+        load = estimator._follow(bench.inverse.scale_values(there))[0]
+        moved.append(load[3:] - found[0].position)
+    assert moved[0] == pytest.approx([1e-4, 0, 0], abs=2e-6)
+    assert moved[1] == pytest.approx([1e-4, 0, 0], abs=2e-6)

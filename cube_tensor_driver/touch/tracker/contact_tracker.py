@@ -17,6 +17,7 @@ integrals of the field, which are less exact.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -111,7 +112,11 @@ class TrackedContact(NamedTuple):
 
 
 class ContactTracker:
-    """Follows the contacts of a skin from scan to scan (set of values of all cubes)."""
+    """Follows the contacts of a skin from scan to scan (set of values of all cubes).
+
+    Attributes:
+        single_fits: Fits of one Hertz contact each in the newest scan, by the ids of the contacts.
+    """
 
     def __init__(self, inverse: SurfaceInverse, min_pressure: float) -> None:
         """Create a tracker without contacts.
@@ -127,6 +132,7 @@ class ContactTracker:
         self._last_positions = np.zeros((0, 3))
         self._last_ids: list[int] = []
         self._next_id = 0
+        self.single_fits: dict[int, HertzFit] = {}
         n_cubes = len(inverse.poses.position)
         n_components = len(inverse.columns)
         self._scaled = np.full((n_cubes, n_components), np.nan)
@@ -172,14 +178,24 @@ class ContactTracker:
 
         contacts = []
         for region in regions:
-            fit = region.fit
-            if fit is None:
-                contacts.append(self._to_parent_frame(region.home, region.integral, False))
-                continue
-            for one in fit.estimate_contacts():
-                contacts.append(self._to_parent_frame(fit.values.home, one, region.is_refined))
-        pressing = [one for one in contacts if one.normal_force > 0]
-        return self._number_contacts(pressing)
+            for one in region.estimate_contacts():
+                if one.force[2] < 0:
+                    contacts.append((region, one))
+        positions, cubes, rotations = self._to_parent_frame(contacts)
+        ids = self._number_contacts(positions)
+        fits = [(number, region.fit) for number, (region, _) in zip(ids, contacts, strict=True)]
+        self.single_fits = {
+            number: fit
+            for number, fit in fits
+            if isinstance(fit, HertzFit) and len(fit.found.forces) == 1
+        }
+        normals = inverse.poses.rotation[cubes, :, 2]
+        places = zip(ids, positions, normals, rotations, contacts, strict=True)
+        found = [
+            _describe_contact(number, position, normal, rotation, one, region.is_refined)
+            for number, position, normal, rotation, (region, one) in places
+        ]
+        return sorted(found, key=lambda contact: -contact.normal_force)
 
     @property
     def _fitted(self) -> list[TrackedRegion]:
@@ -443,59 +459,43 @@ class ContactTracker:
 
     def _to_parent_frame(
         self,
-        home: int,
-        estimate: ContactEstimate,
-        is_refined: bool,
-    ) -> TrackedContact:
-        """Convert an estimate from the flattened skin to the skin's parent frame.
+        contacts: list[tuple[TrackedRegion, ContactEstimate]],
+    ) -> tuple[Array, Index, Array]:
+        """Find where n contacts are on the skin, from their positions on the skin laid flat.
 
         Args:
-            home: Index of the cube around which the skin is laid flat.
-            estimate: Force and position of the contact, with variances, on the flattened skin.
-            is_refined: Value of `TrackedContact.refined`.
-        """
-        inverse = self._inverse
-        places, angles = inverse.unroll(home, slice(None))
-        offset = estimate.place - places
-        squared_distance = (offset**2).sum(axis=1)
-        cube = int(squared_distance.argmin())
-        to_cube = make_rotations_about_normal(angles[cube])
-        rotation = inverse.poses.rotation[cube]
-        local = to_cube[:2, :2] @ offset[cube]
-        from_cube = np.array([*local, inverse.depth])
-        position = inverse.poses.position[cube] + rotation @ from_cube
-
-        shear = float(np.linalg.norm(estimate.force[:2]))
-        # To first order, the length of the shear force only changes by errors along its direction.
-        direction = estimate.force[:2] / max(shear, 1e-300)
-        shear_variance = direction @ estimate.force_covariance[:2, :2] @ direction
-        return TrackedContact(
-            id=-1,
-            position=position,
-            normal=rotation[:, 2].copy(),
-            force=rotation @ to_cube @ estimate.force,
-            normal_force=float(-estimate.force[2]),
-            shear_force=shear,
-            moment=estimate.moment,
-            area=estimate.area,
-            position_uncertainty=float(np.sqrt(estimate.place_variance.mean())),
-            force_uncertainty=float(np.sqrt(estimate.force_covariance[2, 2])),
-            shear_uncertainty=float(np.sqrt(shear_variance)),
-            moment_uncertainty=float(np.sqrt(estimate.moment_variance)),
-            area_uncertainty=float(np.sqrt(estimate.area_variance)),
-            refined=is_refined,
-        )
-
-    def _number_contacts(self, contacts: list[TrackedContact]) -> list[TrackedContact]:
-        """Give each contact the id of the nearest contact of the previous scan, or a new one.
+            contacts: The estimates, with their regions.
 
         Returns:
-            The contacts with their ids, the one with the largest normal force first.
+            Positions (n, 3) in m in the skin's parent frame, indices (n,) of the nearest cubes, and
+            rotations (n, 3, 3) from the frame of the estimate to the parent frame.
         """
-        positions = np.array([one.position for one in contacts])
-        positions = positions.reshape(-1, 3)
+        inverse = self._inverse
+        n = len(contacts)
+        cubes = np.zeros(n, np.intp)
+        local = np.full((n, 3), inverse.depth)
+        angles = np.zeros(n)
+        for number, (region, one) in enumerate(contacts):
+            places, angle = inverse.unroll(region.frame, slice(None))
+            x, y = (one.place - places).T
+            cube = (x * x + y * y).argmin()
+            cubes[number], angles[number] = cube, angle[cube]
+            local[number, :2] = x[cube], y[cube]
+        to_cubes = make_rotations_about_normal(angles)
+        in_cubes = local.copy()
+        in_cubes[:, :2] = np.einsum("nij,nj->ni", to_cubes[:, :2, :2], local[:, :2])
+        rotation = inverse.poses.rotation[cubes]
+        positions = inverse.poses.position[cubes] + np.einsum("nij,nj->ni", rotation, in_cubes)
+        return positions, cubes, rotation @ to_cubes
+
+    def _number_contacts(self, positions: Array) -> list[int]:
+        """Return the id of the nearest contact of the previous scan, or a new one, for each contact.
+
+        Args:
+            positions: Positions (n, 3) of the contacts in m.
+        """
         distance = cdist(positions, self._last_positions)
-        ids = [-1] * len(contacts)
+        ids = [-1] * len(positions)
         rows, columns = np.nonzero(distance < MATCH_PITCHES * self._inverse.pitch)
         nearest_first = np.argsort(distance[rows, columns], kind="stable")
         for pair in nearest_first.tolist():
@@ -508,5 +508,46 @@ class ContactTracker:
                 ids[row] = self._next_id
                 self._next_id += 1
         self._last_positions, self._last_ids = positions, ids
-        numbered = [one._replace(id=k) for one, k in zip(contacts, ids, strict=True)]
-        return sorted(numbered, key=lambda contact: -contact.normal_force)
+        return ids
+
+
+def _describe_contact(
+    number: int,
+    position: Array,
+    normal: Array,
+    rotation: Array,
+    estimate: ContactEstimate,
+    is_refined: bool,
+) -> TrackedContact:
+    """Describe a contact in the skin's parent frame.
+
+    Args:
+        number: Its id.
+        position: Position (3,) in m.
+        normal: Unit normal (3,) out of the skin.
+        rotation: Rotation (3, 3) from the frame of the estimate.
+        estimate: Force of the contact, with variances, on the flattened skin.
+        is_refined: Value of `TrackedContact.refined`.
+    """
+    x, y, z = estimate.force.tolist()
+    shear = math.hypot(x, y)
+    (xx, xy, _), (_, yy, _), (_, _, zz) = estimate.force_covariance.tolist()
+    # To first order, the length of the shear force only changes by errors along its direction.
+    shear_variance = (x * x * xx + 2 * x * y * xy + y * y * yy) / max(shear**2, 1e-300)
+    place_variance = sum(estimate.place_variance.tolist()) / 2
+    return TrackedContact(
+        id=number,
+        position=position,
+        normal=normal,
+        force=rotation @ estimate.force,
+        normal_force=-z,
+        shear_force=shear,
+        moment=estimate.moment,
+        area=estimate.area,
+        position_uncertainty=math.sqrt(place_variance),
+        force_uncertainty=math.sqrt(zz),
+        shear_uncertainty=math.sqrt(shear_variance),
+        moment_uncertainty=math.sqrt(estimate.moment_variance),
+        area_uncertainty=math.sqrt(estimate.area_variance),
+        refined=is_refined,
+    )

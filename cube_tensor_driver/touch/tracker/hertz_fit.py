@@ -16,6 +16,7 @@ interpolation, Neural Computation 4 (1992) 415 (evidence).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -143,6 +144,7 @@ class HertzFit:
         last_step: Size of the last Gauss-Newton step, as in `SETTLED_STEP`; infinite before the
             first step.
         linear: Response of the cubes for the next Gauss-Newton step, from `linearise`.
+        contact_precision: Prior precisions (8 J,) of the parameters of the contacts.
     """
 
     linear: Linearisation
@@ -190,19 +192,13 @@ class HertzFit:
             moment_deviation,
         ]
         precision = np.array(deviations) ** -2
-        self._contact_precision = np.tile(precision, n_contacts)
+        self.contact_precision = np.tile(precision, n_contacts)
         self._elastomer_errors = np.zeros(1)  # the first error is that of the depth
 
-    def compute_prior_precision(self, quantities: int) -> Array:
-        """Return the prior precisions (p,) of the parameters for the next linearisation.
-
-        Args:
-            quantities: Number S of quantities of the elastomer.
-        """
-        is_first = not np.isfinite(self.last_step)
-        precision = START_ELASTOMER_PRECISION if is_first else self.misfit
-        elastomer_precision = np.full(quantities, precision)
-        return np.append(self._contact_precision, elastomer_precision)
+    @property
+    def elastomer_precision(self) -> float:
+        """Prior precision of the errors of the elastomer for the next linearisation."""
+        return self.misfit if self.last_step < np.inf else START_ELASTOMER_PRECISION
 
     @property
     def depth_error(self) -> float:
@@ -346,9 +342,32 @@ class HertzFit:
         near_count = int(known[linear.nearest].sum())
         self.shape_misfit = near_square / max(near_count, 1)
 
-        n_parameters = len(self._contact_precision)
+        n_parameters = len(self.contact_precision)
         self._elastomer_errors = change[n_parameters:]
         self._move_contacts(change[:n_parameters].reshape(-1, _N_PARAMETERS))
+
+    def compute_weights(self, cubes: Index) -> Array:
+        """Return the derivatives of force and position of the first contact by the values of cubes.
+
+        The errors of the elastomer are held constant.
+
+        Args:
+            cubes: Indices (m,) of cubes of the skin. Cubes that are not in the fit get weight 0.
+
+        Returns:
+            Weights (5, m, C): force in N and position in m in the frame of the home cube, by the C
+            components of each cube in Pa.
+        """
+        rows, columns = np.nonzero(self.values.cubes[:, None] == cubes)
+        n_parameters = len(self.contact_precision)
+        whitening = self.values.whitening[rows]
+        jacobian = self.linear.jacobian.reshape(*self.values.known.shape, -1)
+        jacobian = jacobian[rows, :, :n_parameters].reshape(-1, n_parameters)
+        information = jacobian.T @ jacobian + np.diag(self.contact_precision)
+        solved = np.linalg.solve(information, jacobian.T)[:5].reshape(5, *whitening.shape[:2])
+        weights = np.zeros((5, len(cubes), whitening.shape[2]))
+        weights[:, columns] = np.einsum("knc,ncd->knd", solved, whitening)
+        return weights
 
     def _move_contacts(self, change: Array) -> None:
         """Set the contacts to those at which the response was linearised plus a Gauss-Newton step.
@@ -441,15 +460,14 @@ class HertzFit:
     def estimate_contacts(self) -> list[ContactEstimate]:
         """Return force, position, moment and area of each contact."""
         estimates = []
-        for discs, change, covariance in zip(
-            zip(*self.found, strict=True),
+        for force, centre, log_size, change, covariance in zip(
+            *self.found,
             self._change,
             self._covariances,
             strict=True,
         ):
-            force, centre, log_size = discs
-            variances = np.diag(covariance)
-            area = float(np.pi * np.exp(2 * log_size))
+            variances = covariance.diagonal()
+            area = math.pi * math.exp(2 * log_size)
             estimate = ContactEstimate(
                 force=force,
                 force_covariance=covariance[:3, :3],
@@ -502,23 +520,21 @@ def _linearise_alike(
     """
     n_fits = len(fits)
     shape = n_fits, contacts, cubes
-    forces = np.stack([fit.found.forces for fit in fits])
-    centres = np.stack([fit.found.centres for fit in fits])
-    log_sizes = np.stack([fit.found.log_sizes for fit in fits])
-    place = np.stack([fit.values.place for fit in fits])
-    angle = np.stack([fit.values.angle for fit in fits])
-    variant = np.stack([fit.values.variant for fit in fits])
+    forces = np.array([fit.found.forces for fit in fits])
+    centres = np.array([fit.found.centres for fit in fits])
+    log_sizes = np.array([fit.found.log_sizes for fit in fits])
+    place = np.array([fit.values.place for fit in fits])
+    angle = np.array([fit.values.angle for fit in fits])
+    variant = np.array([fit.values.variant for fit in fits])
     offset = place[:, None] - centres[:, :, None]
 
     # The responses are computed for all fits, contacts and cubes in one call.
     response = inverse.contact_response
     positions = offset.reshape(-1, 2)
-    angles = np.broadcast_to(angle[:, None], shape).ravel()
-    variants = np.broadcast_to(variant[:, None], shape).ravel()
-    sizes = np.exp(log_sizes)
-    all_sizes = np.repeat(sizes, cubes)
-    all_forces = forces.reshape(-1, 3)
-    all_forces = np.repeat(all_forces, cubes, axis=0)
+    angles = angle.repeat(contacts, axis=0).ravel()
+    variants = variant.repeat(contacts, axis=0).ravel()
+    all_sizes = np.exp(log_sizes).ravel().repeat(cubes)
+    all_forces = forces.reshape(-1, 3).repeat(cubes, axis=0)
     slopes = response.compute_response_slopes(
         positions,
         angles,
@@ -526,68 +542,58 @@ def _linearise_alike(
         all_sizes,
         all_forces,
     )
-    slopes = slopes[:, :, inverse.columns]
     # The response is not linear in the depth. Its change from the stated depth to the one found
     # follows from the derivative halfway between these two depths. In a half space, this derivative
     # is that at the stated depth for a load whose lengths are divided by `halfway`, times a factor.
     # The factor is the same for all values, so it only scales the error that the next step finds.
     depth_errors = np.array([fit.depth_error for fit in fits])
     halfway = np.repeat(1 + depth_errors / 2, contacts * cubes)
-    near_positions = positions / halfway[:, None]
     sensitivity = response.sensitivity(
-        near_positions,
+        positions / halfway[:, None],
         angles,
         all_sizes / halfway,
         all_forces,
     )
     sensitivity[:, :, len(STRESS) :] /= halfway[:, None, None]
-    sensitivity = sensitivity[:, :, inverse.columns]
 
-    by_contact = slopes.reshape(*shape, *slopes.shape[1:])
-    by_contact = by_contact.astype(float)
-    by_force = by_contact[:, :, :, :3]
-    values = np.einsum("kjnac,kja->knc", by_force, forces)
     # The derivative by the flatness is the response to a contact minus that to a mixture of a wider
     # and a narrower one (see `FLATNESS_STEP`, h). With the derivatives `first` and `second` by the
     # logarithm of the radius, it is h^2 (first - second / 2), to order h^2.
-    first = by_contact[:, :, :, 5]
-    second = by_contact[:, :, :, 6]
-    by_contact[:, :, :, 6] = FLATNESS_STEP**2 * (first - second / 2)
-    by_contacts = by_contact.transpose(0, 2, 4, 1, 3)
-    by_contacts = by_contacts.reshape(*values.shape, -1)
-    by_elastomer = sensitivity.reshape(*shape, *sensitivity.shape[1:])
-    by_elastomer = by_elastomer.sum(axis=1)
-    by_elastomer = by_elastomer.swapaxes(2, 3)
-    derivatives = np.concatenate([by_contacts, by_elastomer], axis=3)
+    first, second = slopes[:, 5], slopes[:, 6]
+    slopes[:, 6] = FLATNESS_STEP**2 * (first - second / 2)
 
-    n_parameters = derivatives.shape[3]
-    whitening = np.stack([fit.values.whitening for fit in fits])
-    jacobian = whitening @ derivatives
-    jacobian = jacobian.reshape(n_fits, -1, n_parameters)
-    white_values = whitening @ values[..., None]
-    white_values = white_values.reshape(n_fits, -1)
-
+    # The values are the last column beside the derivatives, so that one product whitens both.
     quantities = sensitivity.shape[1]
-    precision = np.stack([fit.compute_prior_precision(quantities) for fit in fits])
-    usual_size = USUAL_SIZE * inverse.depth
-    prior_offset = np.zeros_like(precision)
     n_contact_parameters = _N_PARAMETERS * contacts
-    of_contacts = prior_offset[:, :n_contact_parameters]
-    of_contacts = of_contacts.reshape(n_fits, contacts, _N_PARAMETERS)
-    of_contacts[:, :, :3] = forces
-    of_contacts[:, :, 5] = log_sizes - np.log(usual_size)
-    prior_information = precision[:, None] * np.eye(n_parameters)
+    n_parameters = n_contact_parameters + quantities
+    columns = np.empty((n_fits, cubes, len(inverse.columns), n_parameters + 1))
+    by_contact = inverse.select(slopes).reshape(*shape, _N_PARAMETERS, -1)
+    of_contacts = by_contact.transpose(0, 2, 4, 1, 3)
+    columns[..., :n_contact_parameters] = of_contacts.reshape(*columns.shape[:3], -1)
+    by_elastomer = inverse.select(sensitivity).reshape(*shape, quantities, -1).sum(axis=1)
+    columns[..., n_contact_parameters:n_parameters] = by_elastomer.swapaxes(2, 3)
+    by_force = columns[..., :n_contact_parameters].reshape(*columns.shape[:3], contacts, -1)
+    columns[..., -1] = np.einsum("kncjp,kjp->knc", by_force[..., :3], forces)
+    whitening = np.array([fit.values.whitening for fit in fits])
+    white = (whitening @ columns).reshape(n_fits, -1, n_parameters + 1)
+    jacobian = white[..., :-1]
+
+    precision = np.empty((n_fits, n_parameters))
+    precision[:, :n_contact_parameters] = fits[0].contact_precision
+    precision[:, n_contact_parameters:] = [[fit.elastomer_precision] for fit in fits]
+    prior_offset = np.zeros_like(precision)
+    from_median = prior_offset[:, :n_contact_parameters].reshape(n_fits, contacts, -1)
+    from_median[:, :, :3] = forces
+    from_median[:, :, 5] = log_sizes - np.log(USUAL_SIZE * inverse.depth)
     information = jacobian.swapaxes(1, 2) @ jacobian
-    information += prior_information
+    np.einsum("kpp->kp", information)[:] += precision
     covariance = np.linalg.inv(information)
-    distance = np.linalg.norm(offset, axis=3)
-    distance = distance.min(axis=1)
-    by_distance = np.argsort(distance, axis=1, kind="stable")
-    nearest = by_distance[:, :SHAPE_CUBES]
+    squared_distance = (offset**2).sum(axis=3).min(axis=1)
+    nearest = squared_distance.argsort(axis=1, kind="stable")[:, :SHAPE_CUBES]
     results = zip(
-        values,
-        derivatives,
-        white_values,
+        columns[..., -1],
+        columns[..., :-1],
+        white[..., -1],
         jacobian,
         prior_offset,
         precision,

@@ -9,6 +9,7 @@ The noise of a cube grows with the stress of its pads, because the relative erro
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg.lapack import dtrtri
 
 from ...core.arrays import Array, Index, Mask
 from ..inverse import SurfaceInverse
@@ -146,8 +147,9 @@ class CubeNoise:
         errors = self._inverse.errors[cubes] * is_known[:, :, None]
         covariance += errors @ errors.swapaxes(1, 2)
         covariance = regularise(covariance, is_known)
-        cholesky_factor = np.linalg.cholesky(covariance)
-        whitening = np.linalg.inv(cholesky_factor)
+        # The inverse of a triangular matrix takes a quarter of the time of a general one.
+        factors = np.linalg.cholesky(covariance)
+        whitening = np.array([dtrtri(factor, lower=1)[0] for factor in factors])
         self.whitening[cubes] = whitening * is_known[:, None]
         self._variance[cubes] = variance
         self.version[cubes] += 1

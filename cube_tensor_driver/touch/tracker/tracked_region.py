@@ -9,6 +9,7 @@ the one with the greater evidence (probability of the values) is kept.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from copy import copy
 from enum import IntEnum
@@ -182,7 +183,6 @@ class TrackedRegion:
 
     Attributes:
         points: Indices (k,) of the k points of the surface in the region, in the newest scan.
-        cubes: Indices (m,) of the cubes below these points.
         peak: Largest pressure in Pa in the region, at the depth of the cubes' centres.
         near: Other regions within `NEIGHBOUR_REACH_PITCHES`. Their contacts change the values of
             the same cubes, so the fit of this region subtracts the response to them.
@@ -190,7 +190,6 @@ class TrackedRegion:
         others: Response (n, C), in Pa, of the n cubes of the fit to all other regions.
         gap: Distance from the nearest other region in m.
         response: Response (cubes, C), in Pa, of all cubes of the skin to this region.
-        home: Index of the cube in the middle of the region, around which the skin is laid flat.
         integral: Estimate of the contact from integrals of the traction field, used until there is
             a fit; in the frame of the cube that was `home` when it was computed.
         waited: Number of scans (sets of values of all cubes) since the fit was last improved.
@@ -203,7 +202,6 @@ class TrackedRegion:
         respond: Respond,
     ) -> None:
         self.points: Index = np.zeros(0, np.intp)
-        self.cubes: Index = np.zeros(0, np.intp)
         self.peak = 0.0
         self.near: list[TrackedRegion] = []
         self.fit: HertzFit | NodeFit | None = None
@@ -212,7 +210,6 @@ class TrackedRegion:
         n_cubes = len(inverse.variant)
         self.response = np.zeros((n_cubes, len(inverse.columns)))
         self._responding = np.zeros(n_cubes, bool)
-        self._is_around = np.zeros(n_cubes, bool)
         self.waited = 0
         self._inverse = inverse
         self._noise = noise
@@ -227,8 +224,9 @@ class TrackedRegion:
         self._is_tried = False
         self._bad_scans = 0
         self._steps = 0
-        self.home = -1
         self.integral: ContactEstimate
+        # `_checked` are the contacts that `find_stale_cubes` has compared last.
+        self._checked: Discs | None = None
         self._responded = (
             -1,
             Discs(
@@ -248,15 +246,7 @@ class TrackedRegion:
             points: Indices of the points of the surface that form the region in this scan.
             peak: Largest pressure in Pa at these points, at the depth of the cubes' centres.
         """
-        if points is not self.points:
-            self.points = points
-            self.cubes = np.unique(self._inverse.cube[points])
-            positions = self._inverse.points[points]
-            from_middle = positions - positions.mean(axis=0)
-            middle = (from_middle**2).sum(axis=1).argmin()
-            self.home = int(self._inverse.cube[points[middle]])
-            self._is_around[:] = False
-            self._is_around[self._inverse.near[self.cubes, : NEAREST_CUBES[-1]]] = True
+        self.points = points
         self.peak = peak
         self.waited += 1
         self._is_tried = False
@@ -277,6 +267,28 @@ class TrackedRegion:
         """
         if isinstance(self.fit, NodeFit) and not self.fit.values.has_same_values:
             self.fit = None
+
+    @property
+    def cubes(self) -> Index:
+        """Indices (m,) of the cubes below the points of the region."""
+        return np.unique(self._inverse.cube[self.points])
+
+    @property
+    def home(self) -> int:
+        """Index of the cube in the middle of the region, around which the skin is laid flat."""
+        positions = self._inverse.points[self.points]
+        from_middle = positions - positions.mean(axis=0)
+        middle = (from_middle**2).sum(axis=1).argmin()
+        return int(self._inverse.cube[self.points[middle]])
+
+    @property
+    def frame(self) -> int:
+        """Index of the cube in whose frame `estimate_contacts` states the contacts."""
+        return self.home if self.fit is None else self.fit.values.home
+
+    def estimate_contacts(self) -> list[ContactEstimate]:
+        """Return force, position, moment and area of each contact of the region."""
+        return [self.integral] if self.fit is None else self.fit.estimate_contacts()
 
     @property
     def _is_misfit_larger(self) -> bool:
@@ -301,12 +313,14 @@ class TrackedRegion:
         values = fit.values
         found = fit.found
         below = values.find_nearest_cubes(found.centres)
-        if not (self._is_around[below] & (found.forces[:, 2] < 0)).all():
+        around = inverse.near[inverse.cube[self.points], : NEAREST_CUBES[-1]]
+        is_around = all((around == cube).any() for cube in below)
+        if not is_around or found.forces[:, 2].max() >= 0:
             self.fit = None
             return
         # The home cube is the origin of the frame of the contacts.
         mean_centre = found.centres.sum(axis=0) / len(below)
-        from_home = np.hypot(*mean_centre)
+        from_home = math.hypot(*mean_centre.tolist())
         if from_home > HOME_PITCHES * inverse.pitch:
             home = int(values.find_nearest_cubes(mean_centre[None])[0])
             if home != values.home:
@@ -365,9 +379,7 @@ class TrackedRegion:
         The contacts cause nearly the same stress in distant cubes as the traction. They are in the
         frame of the home cube, around which the skin is laid flat.
         """
-        if self.fit is not None:
-            return self.fit.values.home, self.fit.discs
-        return self.home, self._start
+        return self.frame, self._start if self.fit is None else self.fit.discs
 
     @property
     def _start(self) -> Discs:
@@ -394,12 +406,13 @@ class TrackedRegion:
         home, discs = self.discs
         old_home, old = self._responded
         is_changed = home != old_home or len(old.forces) != len(discs.forces)
-        if not is_changed:
+        if not is_changed and discs is not self._checked:
             relative_shift = np.abs(discs.centres - old.centres).max() / self.gap
             force_change = np.abs(discs.forces - old.forces).max()
             relative_change = force_change / np.abs(discs.forces).max()
             limit = MAX_STALE_CHANGE * self.relative_error
             is_changed = max(relative_shift, relative_change) >= limit
+        self._checked = discs
         if is_changed:
             self._responding[:] = False
             self._responded = home, discs
@@ -671,33 +684,31 @@ def _update_stale_responses(
         inverse: Poses and responses of the skin.
         stale: Regions, at least one, and the indices of the cubes whose response is computed.
     """
-    normals = inverse.poses.rotation[:, :, 2]
-    offsets, angles, sizes, forces, all_cubes = [], [], [], [], []
-    for region, cubes in stale:
+    # There is one load for each Hertz contact of a region; its response is computed at `at_cubes`.
+    loads = []
+    for region, at_cubes in stale:
         home, discs = region.discs
-        place, angle = inverse.unroll(home, cubes)
-        # On a bent skin, cubes that face away from a contact do not respond to it.
-        is_facing = normals[cubes] @ normals[home] > MIN_FACING
-        for force, centre, log_size in zip(*discs, strict=True):
-            offsets.append(place - centre)
-            angles.append(angle)
-            sizes.append(np.full(len(cubes), np.exp(log_size)))
-            forces.append(is_facing[:, None] * force)
-            all_cubes.append(cubes)
+        loads += [(home, at_cubes, *disc) for disc in zip(*discs, strict=True)]
+    homes, of_cubes, forces, centres, log_sizes = zip(*loads, strict=True)
+    counts = [len(at_cubes) for at_cubes in of_cubes]
+    cubes = np.concatenate(of_cubes)
+    unrolled = [inverse.unroll(*pair) for pair in zip(homes, of_cubes, strict=True)]
+    places, angles = map(np.concatenate, zip(*unrolled, strict=True))
+    # On a bent skin, cubes that face away from a contact do not respond to it.
+    normals = inverse.poses.rotation[:, :, 2]
+    home_normals = normals[list(homes)].repeat(counts, axis=0)
+    is_facing = np.einsum("nk,nk->n", normals[cubes], home_normals) > MIN_FACING
     measured = inverse.contact_response.compute_response_to_forces(
-        np.concatenate(offsets),
-        np.concatenate(angles),
-        inverse.variant[np.concatenate(all_cubes)],
-        np.concatenate(sizes),
-        np.concatenate(forces),
-    )[:, inverse.columns]
+        places - np.repeat(centres, counts, axis=0),
+        angles,
+        inverse.variant[cubes],
+        np.exp(log_sizes).repeat(counts),
+        is_facing[:, None] * np.repeat(forces, counts, axis=0),
+    )
+    measured = inverse.select(measured)
     first = 0
-    for region, cubes in stale:
-        end = first + len(region.discs[1].forces) * len(cubes)
-        by_disc = measured[first:end].reshape(
-            -1,
-            len(cubes),
-            measured.shape[1],
-        )
-        region.take_response(cubes, by_disc.sum(axis=0))
+    for region, at_cubes in stale:
+        end = first + len(region.discs[1].forces) * len(at_cubes)
+        by_disc = measured[first:end].reshape(-1, len(at_cubes), measured.shape[1])
+        region.take_response(at_cubes, by_disc.sum(axis=0))
         first = end
