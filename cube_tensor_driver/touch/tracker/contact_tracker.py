@@ -489,7 +489,7 @@ class ContactTracker:
         return positions, cubes, rotation @ to_cubes
 
     def _number_contacts(self, positions: Array) -> list[int]:
-        """Return the id of the nearest contact of the previous scan, or a new one, for each contact.
+        """Return the id of each contact: that of the nearest one in the previous scan, or a new id.
 
         Args:
             positions: Positions (n, 3) of the contacts in m.
