@@ -5,7 +5,6 @@ its weight, and the states of creep and temperature."""
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
@@ -14,7 +13,7 @@ import numpy as np
 from ..core.arrays import Array
 from ..core.compensation.motion import UNKNOWN_MOTION, Motion
 from ..core.errors import MessageError
-from .codec import LITTLE_ENDIAN, SECOND
+from .sequences import encode_header, encode_sequences
 
 if TYPE_CHECKING:
     from ..msg import SkinCompensation
@@ -47,15 +46,11 @@ def encode_compensation(
             `Compensation.collect_states` returns it.
     """
     time_ns, state = motion or UNKNOWN_MOTION
-    text = frame_id.encode() + b"\0"
-    header = struct.pack("<iII", *divmod(stamp_ns, SECOND), len(text))
-    data = header + text + bytes([motion is not None])
+    time_ns, state = motion or UNKNOWN_MOTION
+    begin = encode_header(stamp_ns, frame_id) + bytes([motion is not None])
     effects = [states.get(name, NO_STATE) for name in STATES]
-    for values in (time_ns - stamp_ns, state[:, 0], state[:, 1:], *effects):
-        data += bytes(-len(data) % 4) + struct.pack("<I", values.size)
-        if values.size:
-            data += bytes(-len(data) % 8) + values.tobytes()
-    return LITTLE_ENDIAN + data
+    columns = time_ns - stamp_ns, state[:, 0].ravel(), state[:, 1:].ravel(), *effects
+    return encode_sequences(begin, columns)
 
 
 def read_motion(message: SkinCompensation, stamp_ns: int) -> Motion | None:

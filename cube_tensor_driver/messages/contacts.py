@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages of contacts and surface traction, made in the same way by a node and by reprocessing.
 
-The caller passes the function that constructs a message: a node passes one that uses the classes of
-rclpy, reprocessing one that uses those of the bag library. So the node `contacts` needs no bag
-library.
+For a message of traction, the caller passes the function that constructs it: a node passes one that
+uses the classes of rclpy, reprocessing one that uses those of the bag library. So the node
+`contacts` needs no bag library.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..core.arrays import Array, Index
+from ..core.arrays import AnyArray, Array, Index
 from ..core.errors import BagError
 from ..touch.slip import NO_CONTACTS, SLIP, Slip
 from ..touch.surface import Contact
 from ..touch.touch_detection import NO_TOUCHES
 from ..touch.tracker.contact_tracker import TrackedContact
-from .point_cloud import MakeMessage, make_cloud_message, make_header
-from .types import CONTACTS
+from .point_cloud import MakeMessage, make_cloud_message
+from .sequences import encode_header, encode_sequences
 
 if TYPE_CHECKING:
     from geometry_msgs.msg import Point, Vector3
@@ -51,29 +51,20 @@ _TRACKED_NUMBERS = (
 )
 """Numbers of a contact that only the method `inverse` of contact estimation gives. With another
 method, the arrays of these numbers in the message are empty."""
-_FRICTION = ("friction", "friction_uncertainty", "friction_use")
-"""Numbers of a contact that are taken from `Slip`: friction coefficient, standard deviation of the
-coefficient, and ratio of shear to normal force divided by the coefficient."""
-_VECTORS = {
-    "position": "Point",
-    "normal": "Vector3",
-    "force": "Vector3",
-}
-"""Name of a vector of a contact -> its type in geometry_msgs."""
+_VECTORS = ("position", "normal", "force")
+"""Vectors of a contact in the order of the message SkinContacts."""
 
 
-def make_contacts_message(
-    make: MakeMessage,
+def encode_contacts(
     stamp_ns: int,
     frame_id: str,
     contacts: Sequence[Contact] | Sequence[TrackedContact],
     slip: Slip = NO_CONTACTS,
     touch_id: Index = NO_TOUCHES.id,
-) -> object:
-    """Make a SkinContacts message.
+) -> bytes:
+    """Return a serialised SkinContacts message.
 
     Args:
-        make: Function that constructs a message from its type's name and its fields.
         stamp_ns: Time stamp of the header, in ns since the Unix epoch.
         frame_id: Coordinate frame of the positions, normals and forces.
         contacts: The contacts: all with a tracker (`TrackedContact`) or all without one.
@@ -85,20 +76,20 @@ def make_contacts_message(
     tracked = [contact for contact in contacts if isinstance(contact, TrackedContact)]
     ids = [contact.id for contact in tracked]
     are_refined = [contact.refined for contact in tracked]
-    fields: dict[str, object] = {name: _collect(contacts, name) for name in _NUMBERS}
-    fields |= {name: _collect(tracked, name) for name in _TRACKED_NUMBERS}
-    fields["id"] = np.array(ids, np.uint32)
-    fields["touch_id"] = touch_id
-    fields["refined"] = np.array(are_refined, bool)
-    for name, kind in _VECTORS.items():
-        vectors = [getattr(contact, name) for contact in contacts]
-        fields[name] = [_make_xyz(make, kind, vector) for vector in vectors]
-    fields["slip"] = slip.state.astype(np.uint8)
-    fields |= {name: getattr(slip, name) for name in _FRICTION}
-    fields["partial_slip"] = slip.partial
-    fields["slip_velocity"] = [_make_xyz(make, "Vector3", one) for one in slip.velocity]
-    header = make_header(make, stamp_ns, frame_id)
-    return make(CONTACTS, header=header, **fields)
+    columns: list[AnyArray] = [
+        *(_collect(contacts, name) for name in (*_VECTORS, *_NUMBERS)),
+        np.array(ids, np.uint32),
+        touch_id.astype(np.int64),
+        *(_collect(tracked, name) for name in _TRACKED_NUMBERS),
+        np.array(are_refined, bool),
+        slip.state.astype(np.uint8),
+        slip.friction,
+        slip.friction_uncertainty,
+        slip.friction_use,
+        slip.velocity,
+        slip.partial,
+    ]
+    return encode_sequences(encode_header(stamp_ns, frame_id), columns)
 
 
 def make_traction_message(
@@ -176,12 +167,3 @@ def decode_traction(message: PointCloud2) -> Array:
 def _collect(contacts: Sequence[object], name: str) -> Array:
     """Return one attribute of all contacts as an array whose first axis counts the contacts."""
     return np.array([getattr(contact, name) for contact in contacts], float)
-
-
-def _make_xyz(
-    make: MakeMessage,
-    kind: str,
-    vector: Array,
-) -> object:
-    x, y, z = vector.tolist()
-    return make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)

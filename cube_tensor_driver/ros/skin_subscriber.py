@@ -40,12 +40,14 @@ class FollowedSkin:
         newest: The newest stress of each cube.
         stamp_ns: Stamp of the newest message of `stress`, in ns since the Unix epoch; 0 before the
             first message.
+        arrived_s: Time of the node's clock at which this message arrived, in s.
     """
 
     info: SkinInfo
     poses: CubePoses
     newest: LatestStress
     stamp_ns: int = 0
+    arrived_s: float = 0.0
 
 
 class SkinSubscriber:
@@ -125,7 +127,8 @@ class SkinSubscriber:
         except MessageError as error:
             log_refused_message(self._node, "stress", error)
             return
-        self.skin.newest.update(message.rows, self.now())
+        self.skin.arrived_s = self.now()
+        self.skin.newest.update(message.rows, self.skin.arrived_s)
         self.skin.stamp_ns = int(message.stamp_ns[0])
         if self._on_stress is not None:
             self._on_stress(self.skin.stamp_ns, message.rows)
@@ -225,9 +228,9 @@ class SkinSubscriberNode(CubeNode):
             skin = subscriber.skin
             if skin is None or not self.is_active or not self.has_listeners(publisher):
                 return
-            # The health of cubes is computed at each publication and not at each message of stress,
-            # because a cube becomes stale when no message arrives.
-            health = skin.newest.health(subscriber.now(), STALE_S)
+            # A timer also publishes when no message arrives, so that cubes become stale.
+            now_s = skin.arrived_s if is_followed else subscriber.now()
+            health = skin.newest.health(now_s, STALE_S)
             message = compute(skin, health)
             if message is not None:
                 publisher.publish(message)

@@ -32,7 +32,7 @@ from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import StressRows
-from cube_tensor_driver.messages.contacts import make_contacts_message, make_traction_message
+from cube_tensor_driver.messages.contacts import encode_contacts, make_traction_message
 from cube_tensor_driver.msg import SkinContacts, SkinInfo, SkinStress
 from cube_tensor_driver.ros.compat import make_executor
 from cube_tensor_driver.ros.messages import make_info_message, make_message
@@ -198,7 +198,7 @@ class Source:
         ones = np.ones(N)
         cloud = np.column_stack([self._points, STEP_PA * number * ones, 0 * ones, ones])
         # The page names the node as the source of the field only once both have come.
-        self._contacts.publish(make_contacts_message(make_message, *of, [contact]))
+        self._contacts.publish(encode_contacts(*of, [contact]))
         self._traction.publish(make_traction_message(make_message, *of, cloud))
 
 

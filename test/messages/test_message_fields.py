@@ -13,6 +13,7 @@ pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 
 from bag_maker import START_NS, make_bag
 
+from cube_tensor_driver.bags.metadata import make_typestore
 from cube_tensor_driver.bags.read import Bag, make_message
 from cube_tensor_driver.bags.reprocess.job import Overrides, ReprocessJob, reprocess
 from cube_tensor_driver.browser.markup import format_newtons
@@ -28,10 +29,11 @@ from cube_tensor_driver.core.rows import FrequencyRows, StressRows
 from cube_tensor_driver.messages.compensation import encode_compensation, read_motion
 from cube_tensor_driver.messages.contacts import (
     decode_contacts,
-    make_contacts_message,
+    encode_contacts,
     make_traction_message,
 )
 from cube_tensor_driver.messages.skin_info import read_skin_elastomer
+from cube_tensor_driver.messages.types import CONTACTS
 from cube_tensor_driver.touch.slip import SLIP, STICK, UNKNOWN, Slip
 from cube_tensor_driver.touch.surface import Contact
 from cube_tensor_driver.touch.tracker.contact_tracker import TrackedContact
@@ -227,7 +229,11 @@ def test_each_number_of_a_contact_is_in_its_field(kind):
     numbers = np.arange(1.0, 10).reshape(3, 3) / 7
     slip = Slip(np.array([UNKNOWN, STICK, SLIP]), *numbers, numbers + 5, numbers[0] + 9)
     touches = np.array([START_NS, -1, START_NS + 1])
-    message = make_contacts_message(make_message, START_NS + 5, "wrist", contacts, slip, touches)
+
+    def sent(*values):
+        return make_typestore().deserialize_cdr(encode_contacts(*values), CONTACTS)
+
+    message = sent(START_NS + 5, "wrist", contacts, slip, touches)
     assert message.header.frame_id == "wrist"
     assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == START_NS + 5
     for name in ("position", "normal", "force"):
@@ -250,7 +256,7 @@ def test_each_number_of_a_contact_is_in_its_field(kind):
     assert [one.slips for one in read] == [False, False, True]
     is_tracked = kind is TrackedContact
     assert [format_newtons(one)[0] == "~" for one in read] == [is_tracked, False, is_tracked]
-    without = make_contacts_message(make_message, START_NS, "wrist", contacts)
+    without = sent(START_NS, "wrist", contacts)
     assert not any(one.slips for one in decode_contacts(without))
 
 

@@ -13,7 +13,7 @@ from ...core.rate_limit import find_next_due_ns
 from ...core.reconstructor import Reconstructor
 from ...core.rows import StressRows
 from ...core.stress_errors import StressErrors
-from ...messages.contacts import make_contacts_message, make_traction_message
+from ...messages.contacts import encode_contacts, make_traction_message
 from ...messages.skin_info import (
     describe_geometry,
     read_cube_poses,
@@ -183,19 +183,14 @@ class ContactWriter:
             )
         elif not finder.follow(time_s, values):
             return
-        message = make_contacts_message(
-            make_message,
+        data = encode_contacts(
             stamp_ns,
             self._frame_id,
             finder.contacts,
             finder.slip,
             finder.touch_id,
         )
-        self._writer.write(
-            self._contacts,
-            recorded_ns,
-            serialise(CONTACTS, message),
-        )
+        self._writer.write(self._contacts, recorded_ns, data)
         cloud = None if next_ns is None else finder.make_cloud(values)
         if cloud is not None:
             message = make_traction_message(

@@ -19,7 +19,7 @@ from std_msgs.msg import Float32MultiArray
 from ...config.parameters import CONTACTS
 from ...core.arrays import Array, Index
 from ...core.modes import COMPONENTS
-from ...messages.contacts import make_contacts_message, make_traction_message
+from ...messages.contacts import encode_contacts, make_traction_message
 from ...messages.skin_info import read_cube_calibrations, read_skin_elastomer
 from ...msg import SkinContacts, SkinTouch
 from ...touch.contact_finder import ContactFinder, ContactSettings, make_contact_finder
@@ -100,7 +100,7 @@ class Contacts(SkinSubscriberNode):
         self,
         skin: FollowedSkin,
         health: Index,
-    ) -> SkinContacts | None:
+    ) -> bytes | None:
         finder = self._take_finder()
         if finder is None:
             return None
@@ -126,7 +126,7 @@ class Contacts(SkinSubscriberNode):
                     cloud,
                 )
                 self._traction.publish(message)
-        return self._make_message(skin, finder)
+        return self._encode(skin, finder)
 
     def _on_errors(self, message: Float32MultiArray) -> None:
         shape = [dimension.size for dimension in message.layout.dim]
@@ -148,24 +148,18 @@ class Contacts(SkinSubscriberNode):
         self,
         skin: FollowedSkin,
         health: Index,
-    ) -> SkinContacts | None:
+    ) -> bytes | None:
         finder = self._finder
         if finder is None:
             return None
         values = skin.newest.usable_values(health)
         begins = finder.follow(1e-9 * skin.stamp_ns, values)
-        return self._make_message(skin, finder) if begins else None
+        return self._encode(skin, finder) if begins else None
 
-    def _make_message(
-        self,
-        skin: FollowedSkin,
-        finder: ContactFinder,
-    ) -> SkinContacts:
-        frame_id = skin.info.header.frame_id
-        return make_contacts_message(
-            make_message,
+    def _encode(self, skin: FollowedSkin, finder: ContactFinder) -> bytes:
+        return encode_contacts(
             skin.stamp_ns,
-            frame_id,
+            skin.info.header.frame_id,
             finder.contacts,
             finder.slip,
             finder.touch_id,
