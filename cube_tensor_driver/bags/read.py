@@ -24,7 +24,7 @@ from mcap.exceptions import McapError
 from rosbags.serde import SerdeError
 from rosbags.typesys import TypesysError, get_types_from_msg
 
-from ..core.arrays import AnyArray, Times
+from ..core.arrays import AnyArray, Integers, Times
 from ..core.errors import BagError, MessageError
 from ..core.rows import FrequencyRows, StressRows
 from ..messages.codec import SECOND, Decoded, MessageCodec, frequency_codec, stress_codec
@@ -478,7 +478,7 @@ class Bag:
         topic: str,
         codec: MessageCodec[FrequencyRows] | MessageCodec[StressRows],
         names: Sequence[str],
-    ) -> Iterator[list[AnyArray]]:
+    ) -> Iterator[list[Integers]]:
         """Read some columns of frequencies or stress, which is faster than reading all.
 
         Args:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.arrays import AnyArray, PadMasks, StatusBits, Times
+from ..core.arrays import Integers, PadMasks, StatusBits, Times
 from ..core.matching import NO_MATCH, match_rows
 from ..core.reconstructor import RecordedHealth
 from ..core.rows import FrequencyRows
@@ -43,8 +43,8 @@ class _StressBatch(NamedTuple):
         last_ns: Latest of the stamps, in ns since the Unix epoch.
     """
 
-    cube: AnyArray
-    sequence: AnyArray
+    cube: Integers
+    sequence: Integers
     stamp_ns: Times
     left_out: PadMasks
     status: StatusBits
@@ -163,8 +163,8 @@ class RecordedHealthReader:
                 yield _StressBatch(
                     cube,
                     sequence,
-                    stamp_ns,
-                    left_out,
+                    stamp_ns.astype(np.int64, copy=False),
+                    left_out.astype(np.uint32, copy=False),
                     status=status & HEALTH_BITS,
                     first_ns=int(stamp_ns.min()),
                     last_ns=int(stamp_ns.max()),

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..core.arrays import Integers
 from ..core.rows import COUNTER_RANGE
 from ..messages.codec import frequency_codec
 from .read import Bag
@@ -54,7 +55,7 @@ def summarise_cubes(bag: Bag, topic: str, n_cubes: int) -> Iterator[CubeSummary]
         n_cubes: Number of cubes of the skin.
     """
     # The empty first part makes the concatenation below possible for a topic without messages.
-    parts = [[np.empty(0, np.int64)] * 3]
+    parts: list[list[Integers]] = [[np.empty(0, np.int64)] * 3]
     parts += bag.columns(topic, frequency_codec, ("cube", "sequence"))
     columns = zip(*parts, strict=True)
     stamp_ns, cube, sequence = map(np.concatenate, columns)

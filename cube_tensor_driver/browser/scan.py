@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from typing import NamedTuple, TypeVar
 
-from ..core.arrays import AnyArray, Array
+from ..core.arrays import Array, Index, StatusBits
 from ..core.latest_stress import LatestStress
 from ..core.rows import StressRows
 from ..touch.surface import Contact
@@ -59,8 +59,8 @@ class Scan(NamedTuple):
 
     values: Array
     residual: Array
-    health: AnyArray
-    status: AnyArray
+    health: Index
+    status: StatusBits
     rate: Array
     field: SurfaceField
     contacts: list[Contact]

@@ -26,7 +26,7 @@ from operator import itemgetter
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arrays import Array, Mask
+from ..core.arrays import Array, Mask, Real
 from ..core.calibration import Calibration
 from ..core.errors import FitError
 from ..core.modes import Modes
@@ -131,7 +131,7 @@ class Fit:
 def measured_stress(
     base: Calibration,
     frequency: ArrayLike,
-    temperature: Array | None = None,
+    temperature: Real | None = None,
 ) -> Array:
     """Compute the stresses on P pads under N loads (N, P), in Pa, from their frequencies.
 

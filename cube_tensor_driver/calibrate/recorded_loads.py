@@ -15,7 +15,7 @@ import numpy as np
 from ..bags.read import Bag
 from ..bags.read import stamp_ns as header_stamp_ns
 from ..bags.source import BagSource, open_bag
-from ..core.arrays import AnyArray, Array, Times
+from ..core.arrays import Array, Real, Single, Times
 from ..core.calibration import Calibration
 from ..core.errors import BagError
 from ..core.layout import Layout
@@ -177,7 +177,7 @@ def read_samples(
     source: BagSource,
     number: int,
     n_pads: int,
-) -> tuple[Times, AnyArray, AnyArray]:
+) -> tuple[Times, Single, Single]:
     """Return the samples of a cube. Those in which the device reports a broken pad are left out.
 
     Args:
@@ -304,7 +304,7 @@ def _find_axes(vector: Vector3) -> list[float]:
     return [vector.x, vector.y, vector.z]
 
 
-def average_neighbours(values: AnyArray, size: int) -> Array:
+def average_neighbours(values: Real, size: int) -> Array:
     """Return the means of groups of successive values along the first axis.
 
     Args:

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +29,14 @@ PadMasks = NDArray[np.uint32]
 """Bit masks of pads, one integer per row (sample of one cube); bit p stands for pad p."""
 StatusBits = NDArray[np.uint16]
 """Status bits (defined in `status.py`), per row (sample of one cube) or per pad."""
-AnyArray = NDArray[Any]
-"""Array of any type of numbers."""
+Integers = NDArray[np.integer]
+"""Array of integers of any size."""
+Records = NDArray[np.void]
+"""Structured array, whose fields have names and may have different types."""
+AnyArray = NDArray[np.generic]
+"""Array whose type is not known here, or of no importance."""
+Numbers = TypeVar("Numbers", Single, Array, Real)
+"""Array of real numbers of one precision."""
 
 
 def pad_table(
@@ -73,17 +79,15 @@ def index_cubes(cube: AnyArray, n_cubes: int) -> Index | slice:
     return nearest.astype(np.intp)
 
 
-def multiply(left: AnyArray, right: AnyArray) -> AnyArray:
+def multiply(left: Numbers, right: Numbers) -> Numbers:
     """Multiply row vectors or matrices (..., n) by matrices (..., n, m), with the same bits on
     every processor.
 
     The terms are added in their order. The `@` of numpy (BLAS) adds them in an order that depends
     on the processor.
     """
-    *left_axes, n_terms = left.shape
-    *right_axes, _, n_columns = right.shape
-    shape = np.broadcast_shapes(tuple(left_axes), tuple(right_axes) or (1,))
-    product: AnyArray = np.zeros((*shape, n_columns), right.dtype)
-    for term in range(n_terms):
+    shape: tuple[int, ...] = np.broadcast_shapes(left.shape[:-1], right.shape[:-2] or (1,))
+    product: Numbers = np.zeros((*shape, right.shape[-1]), right.dtype)
+    for term in range(left.shape[-1]):
         product += left[..., term, None] * right[..., term, :]
     return product

@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from .arrays import AnyArray, Index
+from .arrays import Index, Integers, Times
 
 NO_MATCH = -1
 """Index in the result of `match_rows` for a wanted row whose sample is in no known row."""
@@ -31,15 +31,15 @@ class SampleRows(Protocol):
     """
 
     @property
-    def cube(self) -> AnyArray:
+    def cube(self) -> Integers:
         """Index (N,) of the cube of each sample."""
 
     @property
-    def sequence(self) -> AnyArray:
+    def sequence(self) -> Integers:
         """Sequence number (N,) that the hub gave each sample."""
 
     @property
-    def stamp_ns(self) -> AnyArray:
+    def stamp_ns(self) -> Times:
         """Time of sampling (N,), in ns."""
 
 
@@ -52,9 +52,9 @@ class SampleKeys(NamedTuple):
         stamp_ns: Time of the sample (N,), in ns since the epoch of the table's clock.
     """
 
-    cube: AnyArray
-    sequence: AnyArray
-    stamp_ns: AnyArray
+    cube: Integers
+    sequence: Integers
+    stamp_ns: Times
 
 
 def match_rows(known: SampleRows, wanted: SampleRows) -> Index:
@@ -95,7 +95,7 @@ def match_rows(known: SampleRows, wanted: SampleRows) -> Index:
     return found
 
 
-def _make_keys(rows: SampleRows) -> AnyArray:
+def _make_keys(rows: SampleRows) -> Times:
     """Return keys (N,) of rows: integers that combine cube number and sequence number.
 
     Two rows have the same key if they have the same cube and the same sequence number.

@@ -20,8 +20,9 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from .arrays import AnyArray, Array, Index, Mask, PadMasks, Real
+from .arrays import Array, Index, Mask, PadMasks, Real
 from .calibration import Calibration, tabulate_pads
 from .errors import CalibrationError, CubeError, LayoutError
 from .estimator import Estimator, chi2_limit, make_estimator
@@ -513,7 +514,7 @@ class Pipeline:
         stress = np.where(is_used, v * self._stiffness[group], 0)
         return group, is_used, stress
 
-    def _allocate_tables(self, group: AnyArray) -> Tables:
+    def _allocate_tables(self, group: NDArray[np.int32]) -> Tables:
         """Return the tables of the skin, with room for `MAX_CACHED_ESTIMATORS` sets of bad pads.
 
         Args:

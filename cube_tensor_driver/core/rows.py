@@ -9,7 +9,7 @@ other.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Protocol, TypeVar
 
@@ -61,7 +61,12 @@ class _Rows:
         """
         columns = self.columns()
         selected = {name: column[chosen] for name, column in columns.items()}
-        return type(self)(**selected)
+        return self.from_columns(selected)
+
+    @classmethod
+    def from_columns(cls: type[_Kind], columns: Mapping[str, AnyArray]) -> _Kind:
+        """Return a table with these columns, by name."""
+        return cls(**columns)
 
     def columns(self) -> dict[str, AnyArray]:
         """Return the columns that the table has, by name."""
@@ -133,7 +138,8 @@ class FrequencyRows(_Rows):
         if specific_force is not None:
             shape = len(columns["cube"]), 3
             columns["specific_force"] = np.array(np.broadcast_to(specific_force, shape), np.float32)
-        return cls(frequency=np.asarray(frequency), **columns)
+        columns["frequency"] = np.asarray(frequency)
+        return cls.from_columns(columns)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False, repr=False)
@@ -202,11 +208,8 @@ class StressRows(_Rows):
             sequence=sequence,
             left_out=left_out,
         )
-        return cls(
-            stress=np.asarray(stress),
-            gradient=np.asarray(gradient),
-            **columns,
-        )
+        columns |= {"stress": np.asarray(stress), "gradient": np.asarray(gradient)}
+        return cls.from_columns(columns)
 
 
 def concatenate(parts: Sequence[_Kind]) -> _Kind:
@@ -219,7 +222,7 @@ def concatenate(parts: Sequence[_Kind]) -> _Kind:
     joined = {}
     for name in common:
         joined[name] = np.concatenate([column[name] for column in columns])
-    return type(parts[0])(**joined)
+    return parts[0].from_columns(joined)
 
 
 def _fill_columns(cube: ArrayLike, **columns: ArrayLike) -> dict[str, AnyArray]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from transforms3d import euler, quaternions
 
-from .arrays import AnyArray, Array, Real
+from .arrays import Array, Real
 from .errors import CubeError
 from .modes import to_matrix, to_voigt
 
@@ -95,7 +95,7 @@ def traction(stress: Real, normal: ArrayLike) -> Array:
             f"traction: normal {n.tolist()} has length 0; give the direction of the plane's normal"
         )
     unit_normal = n / length
-    matrices: AnyArray = to_matrix(stress)
+    matrices: Real = to_matrix(stress)
     result: Array = np.einsum("...ij,...j->...i", matrices, unit_normal)
     return result
 
@@ -201,7 +201,7 @@ def rpy_from_quaternion(quaternion: ArrayLike) -> Array:
     return np.array(angles)
 
 
-def face_force(stress: Real, side: Array | float) -> Array:
+def face_force(stress: Real, side: Array | float) -> Real:
     """Compute the force w^2 sigma n on a square whose normal n is +z.
 
     Args:
@@ -211,7 +211,7 @@ def face_force(stress: Real, side: Array | float) -> Array:
     Returns:
         Force (N, 3) in the frame of the stress, in N.
     """
-    traction: AnyArray = np.nan_to_num(stress)[..., TRACTION_COMPONENTS]
+    traction: Real = np.nan_to_num(stress)[..., TRACTION_COMPONENTS]
     return side**2 * traction
 
 
@@ -219,7 +219,7 @@ def contact_wrench(
     stress: Real,
     gradient: Real,
     side: float | Array,
-) -> tuple[Array, Array]:
+) -> tuple[Real, Array]:
     """Compute the force and the torque about the centre of a square whose normal n is +z.
 
         force  = w^2 sigma n
@@ -237,7 +237,7 @@ def contact_wrench(
     Returns:
         Force (N, 3) in N and torque (N, 3) in N m.
     """
-    known: AnyArray = np.nan_to_num(gradient)
+    known: Array = np.nan_to_num(gradient)
     zz_x = known[..., 6]
     zz_y = known[..., 7]
     unknown_twist = np.zeros_like(zz_x)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..config.skin import Skin
-from ..core.arrays import AnyArray, Array, Index, Mask
+from ..core.arrays import Array, Index, Mask, Real
 from ..core.defaults import CONTACT_PRESSURE
 from ..core.errors import MessageError
 from ..core.modes import COMPONENTS
@@ -120,7 +120,7 @@ class LoadVerification:
         self._n_cubes = len(skin.cubes)
         self.frequencies = Arrivals(skin)
         self._stress = Arrivals(skin)
-        self._components: list[AnyArray] = []
+        self._components: list[Real] = []
         self._newest_ns = np.zeros(self._n_cubes, np.int64)
         self._log = SampleLog(0, ())
         self._span_ns = (0, 0)
@@ -294,7 +294,7 @@ class LoadVerification:
         return compute_skin_components(self._skin, *self.load.at(seconds))
 
 
-def rms(values: AnyArray) -> float:
+def rms(values: Real) -> float:
     """Return the root mean square of all values that are not NaN."""
     return float(np.sqrt(np.nanmean(values**2)))
 

@@ -22,7 +22,7 @@ import pyarrow.ipc
 
 from ..bags.tables import as_array, as_column
 from ..config.skin import Skin
-from ..core.arrays import AnyArray
+from ..core.arrays import AnyArray, Index
 from ..core.errors import BagError, ConfigError, CubeError
 from ..core.reconstructor import Reconstructor
 from ..core.rows import StressRows, concatenate
@@ -317,7 +317,7 @@ def read_frame_number(picture: AnyArray) -> int:
     return int.from_bytes(number.tobytes(), "big")
 
 
-def find_nearest_cubes(skin: Skin, width: int, height: int) -> AnyArray:
+def find_nearest_cubes(skin: Skin, width: int, height: int) -> Index:
     """Return the number of the cube that each pixel of a picture shows, (height, width).
 
     The skin is seen along its thinnest direction, and each pixel shows the nearest cube.

@@ -237,7 +237,7 @@ def _read_samples(source: BagSource) -> Iterator[tuple[Times, Index]]:
         frequency_codec,
         ("cube",),
     ):
-        yield stamp_ns, np.minimum(cube, n_cubes).astype(np.intp)
+        yield stamp_ns.astype(np.int64, copy=False), np.minimum(cube, n_cubes).astype(np.intp)
 
 
 def _check_rate(plan: BagPlan, seconds: float, fps: int) -> None:

@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import TypeVar, cast
 
 import numpy as np
 
@@ -36,6 +37,9 @@ _CODE = ("mechanics", "touch")
 Arrays = dict[str, AnyArray]
 """Arrays by name, as in one .npz file."""
 
+Cached = TypeVar("Cached", bound=Mapping[str, AnyArray])
+"""Arrays by name, with the types that a function computes."""
+
 
 def find_cache_folder() -> Path:
     """Return the folder of the cached files, below XDG_CACHE_HOME or else below ~/.cache."""
@@ -47,8 +51,8 @@ def find_cache_folder() -> Path:
 def load_or_compute(
     kind: str,
     inputs: Iterable[object],
-    compute: Callable[[], Arrays],
-) -> Arrays:
+    compute: Callable[[], Cached],
+) -> Cached:
     """Load arrays from the cache, or compute and store them.
 
     Args:
@@ -63,12 +67,12 @@ def load_or_compute(
 
     arrays = _load(path)
     if arrays is not None:
-        return arrays
+        return cast(Cached, arrays)
 
-    arrays = compute()
+    computed = compute()
     with suppress(OSError, ConfigError):  # if the folder cannot be written, nothing is stored
-        _store(path, arrays)
-    return arrays
+        _store(path, computed)
+    return computed
 
 
 def _hash_inputs(inputs: Iterable[object]) -> str:
@@ -110,12 +114,12 @@ def _load(path: Path) -> Arrays | None:
     return arrays if np.array_equal(content, _describe(arrays)) else None
 
 
-def _describe(arrays: Arrays) -> AnyArray:
+def _describe(arrays: Mapping[str, AnyArray]) -> AnyArray:
     """Return name, type and shape of each array as an array of texts, such as "one <f8 (300,)"."""
     return np.array([f"{name} {one.dtype.str} {one.shape}" for name, one in arrays.items()])
 
 
-def _store(path: Path, arrays: Arrays) -> None:
+def _store(path: Path, arrays: Mapping[str, AnyArray]) -> None:
     """Store arrays in a file, of which other processes never see an incomplete version.
 
     Arrays of more than `MAX_CACHE_BYTES` are not stored.

@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..core.arrays import Array, Complex, Index, Single
-from .cache import Arrays, load_or_compute
+from .cache import load_or_compute
 from .circular import FIELD_FROM_CIRCULAR, ORDERS, Orders, compute_rotation_phases, rotate_loads
 from .distance_table import DistanceTable, compute_cubic_weights, to_polar
 from .load_response import compute_disc_spectrum
@@ -92,7 +92,7 @@ class ContactResponse:
         """
         inputs = [self._depth, *vars(spectra).values()]
 
-        def compute() -> Arrays:
+        def compute() -> dict[str, Array]:
             radii = DISC_SIZES * self._depth
             loads = [compute_disc_spectrum(spectra.k * radius) for radius in radii]
             return {"discs": spectra.radial(bessel, np.stack(loads))}

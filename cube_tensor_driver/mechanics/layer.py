@@ -26,8 +26,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..core.arrays import AnyArray, Array, Complex
+from ..core.arrays import Array, Complex
 from ..core.defaults import POISSONS_RATIO
 from ..core.errors import ElasticError
 from ..core.modes import COMPONENTS, STRESS
@@ -40,7 +41,8 @@ MEASURED = [FIELD.index(name) for name in COMPONENTS]
 """Indices (15) in `FIELD` of the `COMPONENTS` that cubes measure: six stresses and the nine
 gradients of the normal stresses."""
 
-_WaveStress = dict[str, tuple[AnyArray, AnyArray]]
+_Wave = NDArray[np.complexfloating]
+_WaveStress = dict[str, tuple[_Wave, _Wave]]
 """Stress under a wave of traction on the surface, and the derivative of this stress along z. A key
 such as "LzT" names the stress component Lz and the direction T of the traction, in the axes of the
 wave: L along its wave vector, T across it."""
@@ -281,7 +283,7 @@ def _add_rotated(
     cosine: Array,
     sine: Array,
     name: str,
-    value: Complex,
+    value: _Wave,
 ) -> None:
     """Rotate one stress component from the axes L, T, z of a wave to the axes x, y, z and add it.
 

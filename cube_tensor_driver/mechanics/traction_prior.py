@@ -25,7 +25,7 @@ import numpy as np
 
 from ..core.arrays import Array, Index
 from ..core.modes import COMPONENTS
-from .cache import Arrays, load_or_compute
+from .cache import load_or_compute
 from .circular import CIRCULAR_FROM_FIELD, rotate_loads
 from .distance_table import DistanceTable, to_polar
 from .layer import FIELD
@@ -87,7 +87,7 @@ class TractionPrior:
         self._imaginary = tables["imaginary"]
         self.pressure_variance = float(tables["own"])
 
-    def _tabulate(self) -> Arrays:
+    def _tabulate(self) -> dict[str, Array]:
         """Compute the covariances of the n circular components at the tabulated distances.
 
         Circular components (circular.py) are complex combinations of the stresses and gradients at

@@ -20,8 +20,9 @@ from functools import lru_cache
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..core.arrays import AnyArray, Times
+from ..core.arrays import AnyArray, Integers, Records, Times
 from ..core.errors import MessageError
 from ..core.modes import GRADIENT, STRESS
 from ..core.rows import FrequencyRows, StressRows
@@ -58,6 +59,7 @@ SHAPE_AT = _FRAME_LENGTH_AT
 """Byte offset, from the start of a serialised message, of the bytes that
 `MessageCodec.read_shape_bytes` returns: length and text of the frame id, then number of rows."""
 
+_Scalar = TypeVar("_Scalar", bound=np.generic)
 AnyRows = TypeVar("AnyRows", FrequencyRows, StressRows)
 
 
@@ -197,7 +199,7 @@ class MessageBuffer(Generic[AnyRows]):
         layout: _Layout,
         frame_id: bytes,
     ) -> None:
-        self._record: AnyArray = np.zeros(1, layout.record)
+        self._record: Records = np.zeros(1, layout.record)
         codec.write_constants(self._record, layout, frame_id)
         stamp_ns = np.zeros(layout.shape.rows, np.int64)
         self.rows: AnyRows = codec.make_rows(self._record, stamp_ns)
@@ -267,7 +269,7 @@ class MessageCodec(Generic[AnyRows]):
         self,
         names: Sequence[str],
         messages: bytes | AnyArray,
-    ) -> list[AnyArray]:
+    ) -> list[Integers]:
         """Decode only some columns of the rows, without copying the others.
 
         Args:
@@ -281,9 +283,9 @@ class MessageCodec(Generic[AnyRows]):
             MessageError: See `decode`.
         """
         record, stamp_ns = self._read_records(messages)
-        columns = [_compute_row_times(record, stamp_ns)]
+        columns: list[Integers] = [_compute_row_times(record, stamp_ns)]
         for name in names:
-            columns.append(_read_column(record, name))
+            columns.append(_join_messages(record[name]))
         return columns
 
     def read_shape_bytes(self, data: bytes) -> bytes:
@@ -341,7 +343,7 @@ class MessageCodec(Generic[AnyRows]):
                 record[name] = getattr(rows, name).reshape(record[name].shape)
         return [message.tobytes() for message in record]
 
-    def make_rows(self, record: AnyArray, stamp_ns: Times) -> AnyRows:
+    def make_rows(self, record: Records, stamp_ns: Times) -> AnyRows:
         """Return the rows (samples of cubes) of serialised messages.
 
         Args:
@@ -352,14 +354,14 @@ class MessageCodec(Generic[AnyRows]):
             Rows of all messages. With M = 1 their columns are views of `record`, else copies.
         """
         columns: dict[str, AnyArray] = {
-            name: stamp_ns if name == "stamp_ns" else _read_column(record, name)
+            name: stamp_ns if name == "stamp_ns" else _join_messages(record[name])
             for name in self.columns
         }
-        return self._rows(**columns)
+        return self._rows.from_columns(columns)
 
     def write_constants(
         self,
-        record: AnyArray,
+        record: Records,
         layout: _Layout,
         frame_id: bytes,
     ) -> None:
@@ -378,7 +380,7 @@ class MessageCodec(Generic[AnyRows]):
         if self._has_pads:
             record["n_pads"] = layout.shape.pads
 
-    def _read_records(self, messages: bytes | AnyArray) -> tuple[AnyArray, Times]:
+    def _read_records(self, messages: bytes | AnyArray) -> tuple[Records, Times]:
         """View serialised messages as an array (M,) of the structured dtype of their layout.
 
         The layout states the byte offset and type of each field.
@@ -399,7 +401,7 @@ class MessageCodec(Generic[AnyRows]):
             return np.frombuffer(first, layout.record, 1), stamp_ns
         # DDS middleware may have added bytes at the end of the messages, which are cut off.
         content = np.ascontiguousarray(messages[:, : layout.record.itemsize])
-        record: AnyArray = content.view(layout.record)[:, 0]
+        record: Records = content.view(layout.record)[:, 0]
         for name in ("frame_id", *(f"length of {name}" for name in layout.sequences)):
             if (record[name] != record[name][0]).any():
                 raise MessageError(
@@ -547,7 +549,7 @@ def _make_struct(offsets: Sequence[int]) -> struct.Struct:
     return struct.Struct(form)
 
 
-def _compute_row_times(record: AnyArray, stamp_ns: Times) -> Times:
+def _compute_row_times(record: Records, stamp_ns: Times) -> Times:
     """Return the times of the rows of all messages, one after the other, in ns since 1970.
 
     Args:
@@ -558,17 +560,15 @@ def _compute_row_times(record: AnyArray, stamp_ns: Times) -> Times:
     return times_ns.reshape(-1)
 
 
-def _read_column(record: AnyArray, name: str) -> AnyArray:
-    """Return the values of one field for the rows of all messages, one after the other.
+def _join_messages(values: NDArray[_Scalar]) -> NDArray[_Scalar]:
+    """Return the values of a field for the rows of all messages, one after the other.
 
     Args:
-        record: Messages (M,) as an array of the structured dtype of their layout.
-        name: Name of the field.
+        values: Values of the field in M messages (M, rows of one message, ...).
     """
-    values: AnyArray = record[name]
-    if len(record) == 1:
+    if len(values) == 1:
         # The values of a single message are not copied, which saves time in the nodes.
-        view: AnyArray = values[0]
+        view: NDArray[_Scalar] = values[0]
         return view
     return values.reshape(-1, *values.shape[2:])
 

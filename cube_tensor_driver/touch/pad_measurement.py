@@ -34,7 +34,7 @@ from ..core.arrays import Array
 from ..core.calibration import Calibration
 from ..core.errors import ElasticError
 from ..core.pipeline import Pipeline
-from ..mechanics.cache import Arrays, load_or_compute
+from ..mechanics.cache import load_or_compute
 from ..mechanics.influence import Influence
 from ..mechanics.measurement_model import MeasurementModel
 from ..mechanics.spectra import BesselTable, Spectra, make_wavenumber_quadrature, tabulate_bessel
@@ -157,14 +157,15 @@ def _match_pads(influence: Influence, calibration: Calibration) -> list[int]:
 def _load_decomposition(influence: Influence) -> tuple[Spectra, Array]:
     """Return the result of `_decompose`, from the cache if it is there."""
 
-    def compute() -> Arrays:
+    def compute() -> dict[str, Array]:
         spectra, pads = _decompose(influence)
         return {**vars(spectra), _PADS: pads}
 
     inputs = [influence.depth, influence.place, influence.pads]
     arrays = load_or_compute("pads", inputs, compute)
     pads = arrays.pop(_PADS)
-    return Spectra(**arrays), pads
+    order = arrays.pop("order").astype(np.int64)
+    return Spectra(order=order, **arrays), pads
 
 
 def _decompose(influence: Influence) -> tuple[Spectra, Array]:

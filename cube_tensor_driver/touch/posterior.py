@@ -31,9 +31,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from ..core.arrays import AnyArray, Array, Index, Mask, Single
+from ..core.arrays import Array, Index, Mask, Real, Single
 from ..core.poses import CubePoses
-from ..mechanics.cache import Arrays, load_or_compute
+from ..mechanics.cache import load_or_compute
 from ..mechanics.traction_prior import TractionPrior
 from .nearest_cubes import find_nearest_cubes
 from .prior import AMPLITUDE, covariance_matrix
@@ -160,13 +160,13 @@ class WindowPosteriors:
         inputs += [example.columns, example.by_pad, example.variant]
         points = make_square_points(spacing, side)
 
-        def solve_kinds() -> Arrays:
+        def solve_kinds() -> dict[str, Real]:
             """Compute the arrays of `_Window` for all kinds of windows.
 
             Returns:
                 Arrays by their names in `_Window`, each with the kinds as an additional first axis.
             """
-            solved: dict[str, AnyArray] = {}
+            solved: dict[str, Real] = {}
             # The matrices of a kind are copied into the result as soon as they are computed,
             # because a list of all of them would double the memory.
             for number, one in enumerate(first):

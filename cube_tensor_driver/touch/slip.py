@@ -40,7 +40,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.arrays import AnyArray, Array, Index, Mask
+from ..core.arrays import Array, Index, Mask, Records
 from .inverse import SurfaceInverse
 from .tracker.contact_estimate import Discs
 from .tracker.contact_tracker import TrackedContact
@@ -280,7 +280,7 @@ class SlipEstimator:
             ("gram", float, (8, 8)),
             ("moments", float, (8, n_values)),
         ]
-        self._contacts: AnyArray = np.zeros(0, fields)
+        self._contacts: Records = np.zeros(0, fields)
         self._times = np.full(n_scans, -np.inf)
         self._fits = NO_FITS
         self.slip = NO_CONTACTS
@@ -688,7 +688,7 @@ def _compute_motion_states(loads: Array, normal: Array) -> Array:
 
 
 def _add_ratio(
-    contacts: AnyArray,
+    contacts: Records,
     chosen: Mask,
     ratio: Array,
     deviation: Array,

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from cube_tensor_driver.core.arrays import AnyArray
+from cube_tensor_driver.core.arrays import Records
 from cube_tensor_driver.core.matching import NO_MATCH
 from cube_tensor_driver.demo.verification import percentile
 from cube_tensor_driver.simulation.sample_log import SampleLog
@@ -33,7 +33,7 @@ sample and its stamp."""
 def check_all(
     record: Record,
     log: SampleLog,
-    readings: AnyArray,
+    readings: Records,
 ) -> dict[str, Any]:
     """Run all checks and return their figures; counts are rows (one sample of one cube each).
 

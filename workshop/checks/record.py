@@ -11,7 +11,7 @@ from typing import Generic
 import numpy as np
 
 from cube_tensor_driver.config.skin import Skin
-from cube_tensor_driver.core.arrays import AnyArray, Mask, Times
+from cube_tensor_driver.core.arrays import Integers, Mask, Times
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
 from cube_tensor_driver.messages.codec import AnyRows
 from cube_tensor_driver.simulation.faults import Fault
@@ -81,7 +81,7 @@ class Span:
 
     def contains(
         self,
-        time_ns: AnyArray | int,
+        time_ns: Integers | int,
         before_s: float = 0.0,
         after_s: float = 0.0,
     ) -> Mask:
@@ -206,10 +206,10 @@ class Samples:
 
 
 def _join_keys(
-    link: AnyArray,
-    boot: AnyArray,
-    number: AnyArray,
-) -> AnyArray:
+    link: Integers,
+    boot: Integers,
+    number: Integers,
+) -> Integers:
     """Join link, number of restarts and sample number, which identify a sample, in one integer
     each.
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cube_tensor_driver.core.arrays import AnyArray, Index, Mask, Real
+from cube_tensor_driver.core.arrays import Index, Integers, Mask, Real, Records
 from cube_tensor_driver.core.matching import NO_MATCH
 from cube_tensor_driver.simulation.sample_log import SampleLog
 
@@ -54,7 +54,7 @@ class Run:
         self,
         record: Record,
         log: SampleLog,
-        readings: AnyArray,
+        readings: Records,
     ) -> None:
         self.record, self.samples = record, Samples(log)
         self.sent = SentReadings(self.samples, readings)
@@ -69,7 +69,7 @@ class Run:
     def examples(
         self,
         finding: str,
-        number: AnyArray,
+        number: Integers,
         time_ns: Index,
         is_found: Mask,
     ) -> list[str]:

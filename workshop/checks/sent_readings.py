@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cube_tensor_driver.core.arrays import AnyArray, Array, Index, Mask, PadMasks, Single
+from cube_tensor_driver.core.arrays import Array, Index, Integers, Mask, PadMasks, Records, Single
 from cube_tensor_driver.core.matching import NO_MATCH
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.device.wire.protocol import TEMPERATURE_UNKNOWN
@@ -48,7 +48,7 @@ def read_readings(
     folder: Path,
     log: SampleLog,
     n_pads: int,
-) -> AnyArray:
+) -> Records:
     """Read the readings of all S samples, in the order of the log's table.
 
     Args:
@@ -81,7 +81,7 @@ class Readings:
 class SentReadings:
     """Finds what the hubs sent for any cube in any sample."""
 
-    def __init__(self, samples: Samples, readings: AnyArray) -> None:
+    def __init__(self, samples: Samples, readings: Records) -> None:
         """Store the readings (S,), see `read_readings`, of all samples of the hubs."""
         self._samples, self._readings = samples, readings
         members = [link.cubes for link in samples.log.links]
@@ -90,7 +90,7 @@ class SentReadings:
         for cubes in members:
             self._index_on_hub[list(cubes)] = np.arange(len(cubes))
 
-    def of(self, cube: AnyArray, sample: Index) -> Readings:
+    def of(self, cube: Integers, sample: Index) -> Readings:
         """Return the readings of cubes (N,) in samples (N,)."""
         readings = self._readings[sample]
         row, on_hub = np.arange(len(sample)), self._index_on_hub[cube]

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 from cube_tensor_driver.config.grid import describe_grid
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.yaml import write_yaml
-from cube_tensor_driver.core.arrays import AnyArray
+from cube_tensor_driver.core.arrays import Records
 from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.demo.running import Observer, end_simulator
 from cube_tensor_driver.processes.children import Children
@@ -72,7 +72,7 @@ class Played(NamedTuple):
 
     record: Record
     log: SampleLog
-    readings: AnyArray
+    readings: Records
     figures: dict[str, Any]
 
 

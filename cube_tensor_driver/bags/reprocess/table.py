@@ -186,7 +186,7 @@ def _read_recorded_health(columns: dict[str, pyarrow.Array]) -> RecordedHealth |
     left_out = columns["recorded_left_out"]
     status = columns["recorded_status"]
     return RecordedHealth(
-        known=as_array(left_out.is_valid()),
+        known=as_array(left_out.is_valid()).astype(bool),
         left_out=as_array(left_out.fill_null(0)).astype(np.uint32),
         status=as_array(status.fill_null(0)).astype(np.uint16),
     )

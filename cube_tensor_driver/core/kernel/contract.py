@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import AnyArray, Array, Mask, PadMasks, Real, Single, StatusBits, Times
+from ..arrays import Array, Mask, PadMasks, Real, Records, Single, StatusBits, Times
 from ..rows import StressRows
 
 BLOCK = 16
@@ -190,7 +190,7 @@ class HealthState(NamedTuple):
     window_ns: Times
 
     @property
-    def cubes(self) -> AnyArray:
+    def cubes(self) -> Records:
         """State of each cube (C,), of type `CUBE_STATE`, as a view."""
         return self.words.view(CUBE_STATE)[:, 0]
 

@@ -69,7 +69,7 @@ class Shape(NamedTuple):
 
 def make_lines(
     name: str,
-    ends: AnyArray,
+    ends: Array,
     width: float,
     colour: Colour = WHITE,
 ) -> Shape:

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from ...core.arrays import AnyArray, Array
+from ...core.arrays import AnyArray, Real
 from .style import choose_curve_style, print_style
 
 Panel = tuple[str, Mapping[str, AnyArray]]
@@ -30,7 +30,7 @@ MAX_LEGEND_LINES = 12
 
 @print_style()
 def draw_panels(
-    times: Array,
+    times: Real,
     time_label: str,
     panels: Sequence[Panel],
 ) -> Figure:

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from ...bags.reprocess.job import reconstruct
 from ...bags.source import BagSource
 from ...calibrate.recorded_loads import find_cubes
-from ...core.arrays import AnyArray
+from ...core.arrays import Array, Real, Single
 from ...core.errors import BagError
 from ...core.modes import GRADIENT, STRESS
 from ...core.rows import StressRows, concatenate
@@ -40,9 +40,9 @@ class TimeSeries:
 
     name: str
     pads: list[str]
-    seconds: AnyArray
-    frequency: AnyArray
-    rest: AnyArray
+    seconds: Real
+    frequency: Single
+    rest: Array
     rows: StressRows
 
 
@@ -68,7 +68,7 @@ def read_cube_series(
     number, *_ = find_cubes(source, bag.path, name)
     n_pads = len(cubes[number].pads)
 
-    frequencies: list[AnyArray] = []
+    frequencies: list[Single] = []
     parts: list[StressRows] = []
     for segment, rows in reconstruct(source):
         seconds = (rows.stamp_ns - bag.start_ns) * 1e-9
