@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -55,8 +54,7 @@ class BlockMeans:
             settings = source.recording.settings[-1]
             self.calibrations = settings.calibrations
             self.rest_frequency = settings.rest_frequency
-            # The model of temperature is not used, because its effect is part of what is measured.
-            pipeline = Pipeline([replace(one, temperature=None) for one in self.calibrations])
+            pipeline = Pipeline(self.calibrations)
             pipeline.rest_frequency = self.rest_frequency
             start_ns = source.bag.start_ns
             shape = len(self.names), (source.bag.end_ns - start_ns) // block_ns + 1

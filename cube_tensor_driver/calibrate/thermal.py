@@ -2,30 +2,35 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fit of the effect of temperature on the unloaded pads of a skin, from bags in which it warms.
 
-    v_p(t) = c_p0 + sum_d c_pd u(t)^d + s_p exp(-t / lag_1) + error,    d = 1 ... degree
+    v_p(t) = c_p0 + sum_d c_pd u(t)^d + sum_l b_pl (T(t) - x_l(t)) + s c_p1 exp(-t / lag_1) + error
 
     v_p    stress on pad p by the pad law at the time t since the beginning of the bag
     T      measured temperature minus the reference temperature
-    u      temperature of the elastomer: T after low-pass filters with the time constants lag_1, ...
-    c_pd   coefficients of pad p
-    s_p    effect of the unknown difference between u and T at the beginning; it is small a priori
+    x_l    T after a low-pass filter with the time constant lag_l
+    u      mean of x_l, which stands for the temperature of the elastomer
+    c_pd   coefficients of pad p, d = 1 ... degree
+    b_pl   coefficients of pad p for each of the `N_FILTERS` filters
+    s      unknown difference between u and T at the beginning; it is small a priori
+
+The time constants are lag_l = lag_1 / `LAG_RATIO`^(l - 1). Conduction of heat has such a series of
+time constants, and each pad has its own mixture of them, because pads at different heights measure
+different averages of the temperature across the layer.
 
 Low-pass filters only approximate conduction of heat. This error is mostly larger than the noise,
 and grows with T - u. So each block of 1 s has the weight
 1 / (noise² + (`LAG_ERROR` × slope × (T - u))²), where slope is the rms of c_p1 over the pads. Times
-at which the temperature is nearly constant then determine the coefficients. The time constants
-minimise the negative logarithm of the likelihood. A second filter, or a second degree, is used only
-if it reduces the residual considerably.
+at which the temperature is nearly constant then determine the coefficients. The longest time
+constant minimises the negative logarithm of the likelihood. A second degree is used only if it
+reduces the residual considerably.
 
-Neighbouring residuals are correlated. So the standard deviations of the coefficients are computed
-from sums of residuals over intervals of the length lag_1 (W. K. Newey, K. D. West, Econometrica 55
-(1987)). The time constants count as further unknowns of each pad.
+The standard deviations of the coefficients follow from these weights, or from the residuals of a
+pad if they are larger than the weights state. Errors of successive blocks are correlated within the
+shortest time constant; slower errors are absorbed by the coefficients of the filters.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -35,13 +40,14 @@ import numpy as np
 from ..core.arrays import Array
 from ..core.calibration import Calibration
 from ..core.compensation.models import ThermalModel
-from ..core.compensation.thermal import START_KELVIN, filter_weights
+from ..core.compensation.thermal import START_KELVIN
 from ..core.errors import BagError, FitError
 from ..core.oscillator import pad_frequency
+from ..messages.codec import SECOND
 from .block_means import BlockMeans, find_lags
 
-BLOCK_NS = 1_000_000_000
-"""Duration, in ns, of the blocks whose mean temperatures and pad stresses are fitted."""
+BLOCK_S = 1
+"""Duration, in s, of the blocks whose mean temperatures and pad stresses are fitted."""
 
 MIN_BLOCKS = 120
 """Smallest number of blocks (of 1 s) with data, in all bags together. With fewer, the dependence of
@@ -59,22 +65,20 @@ MAX_SLOPE_DEVIATION = 0.2
 """Largest relative uncertainty of the linear temperature coefficients of the pads' stress (in Pa/K,
 rms over the pads) with which a fit is accepted."""
 
-LAGS_S = np.geomspace(3.0, 1500.0, 26)
-"""Time constants of low-pass filters, in s, with which the search for the best time constants of
-the elastomer's lag behind the thermometer begins."""
+LAGS_S = np.geomspace(10.0, 1200.0, 30)
+"""Longest time constants of the low-pass filters, in s, among which the most likely one is chosen.
+The mixture of the filters makes up for the distance between them."""
 
-MAX_LAG_STEP = 1.01
-"""Ratio of neighbouring time constants of low-pass filters in the search grid at which the search
-for the best ones ends. The grid begins with `LAGS_S` and becomes finer around the best ones."""
+N_FILTERS = 4
+"""Number of low-pass filters. Three leave 15 Pa of what fast warming changes, four leave 3 Pa."""
+
+LAG_RATIO = 2.5
+"""Ratio of the time constants of successive filters."""
 
 LAG_ERROR = 0.05
 """Standard deviation of the error of the elastomer's temperature as low-pass filters compute it,
 divided by the difference between this temperature and the measured one. The error arises because
 filters only approximate conduction of heat."""
-
-MAX_FILTER_RATIO = 0.8
-"""Ratio of the rms residual with two low-pass filters to the one with a single filter, below which
-two are used to model how the elastomer's temperature lags behind the thermometer."""
 
 MAX_DEGREE_RATIO = 0.3
 """Ratio of the rms residual with a quadratic effect of temperature to that with a linear one, below
@@ -161,7 +165,6 @@ class ThermalFit:
         return replace(
             base,
             rest_frequency=rest,
-            temperature=None,
             thermal=self.model,
             source=source,
         )
@@ -171,22 +174,20 @@ class _Solution(NamedTuple):
     """Solution by weighted least squares for given time constants and degree of the polynomial.
 
     Attributes:
-        lags: Time constants of the low-pass filters, in s, the longest first.
-        behind: How far the filtered temperature u lags behind the measured one (N,), in K.
-        columns: Design matrix (N, K): 1, u, ..., u^degree, then exp(-t / longest time constant),
-            by which the unknown initial difference of elastomer and thermometer decays.
-        weight: Square roots of the weights (N,), in 1/Pa.
-        values: Fitted coefficient of each column for each pad (K, P).
+        lags: Time constants of the low-pass filters (L,), in s, the longest first.
+        behind: How far the mean filtered temperature u lags behind the measured one (N,), in K.
+        values: Fitted coefficients of each pad (K, P): those of 1, u, ..., u^degree, and of how far
+            each filter's output lags behind.
         residual: Measured minus fitted stresses (N, P), in Pa.
+        deviation: Standard deviations of the coefficients of u, ..., u^degree (P, degree).
         misfit: Negative logarithm of the likelihood per stress, without constants.
     """
 
-    lags: tuple[float, ...]
+    lags: Array
     behind: Array
-    columns: Array
-    weight: Array
     values: Array
     residual: Array
+    deviation: Array
     misfit: float
 
 
@@ -207,7 +208,7 @@ def read_warming(
     Raises:
         BagError: A bag has no such cube or states no temperature, or the bags have different cubes.
     """
-    bags = [BlockMeans(path, name, BLOCK_NS, "temperature", width=1) for path in paths]
+    bags = [BlockMeans(path, name, BLOCK_S * SECOND, "temperature", width=1) for path in paths]
     first = bags[0]
     for path, bag in zip(paths, bags, strict=True):
         if bag.names != first.names:
@@ -220,12 +221,7 @@ def read_warming(
     for cube in first.cubes:
         base = bags[-1].calibrations[cube]
         rest = bags[-1].rest_frequency[cube, : base.layout.n_pads]
-        base = replace(
-            base,
-            temperature=None,
-            thermal=None,
-            rest_frequency=rest,
-        )
+        base = replace(base, thermal=None, rest_frequency=rest)
         parts = [bag.of_cube(cube) for bag in bags]
         seconds, stress, temperature = (np.concatenate(each) for each in zip(*parts, strict=True))
         ends = np.cumsum([len(part[0]) for part in parts])
@@ -245,8 +241,7 @@ def read_warming(
 def fit_thermal(data: Warming) -> ThermalFit:
     """Fit the lag of the elastomer and the effect of its temperature on each pad.
 
-    A second low-pass filter and a quadratic effect are used only where they reduce the residual
-    considerably.
+    A quadratic effect is used only where it reduces the residual considerably.
 
     Raises:
         FitError: The bags are too short, the temperature varies too little, something touched the
@@ -258,18 +253,15 @@ def fit_thermal(data: Warming) -> ThermalFit:
             f"{data.name}: {len(data.seconds)} s in which the temperature varies by {span:.2g} K; "
             f"{MIN_BLOCKS} s and {MIN_RANGE:g} K are needed: record while the skin warms or cools"
         )
-    unweighted = _search(data, 1, 1, 0.0)
-    slope = root_mean_square(unweighted.values[1])
-    best = _search(data, 1, 1, slope)
+    slopes = _search(data, 1, np.zeros(data.stress.shape[1])).values[1]
+    slope = root_mean_square(slopes)
+    best = _search(data, 1, slopes)
     # In `best`, the weight of a block depends on the difference between its temperatures before and
     # after the low-pass filter. If these weights change the slope much, the data do not determine
     # it, and `_check` raises an error.
     change = abs(root_mean_square(best.values[1]) / slope - 1)
 
-    two = _search(data, 2, 1, slope)
-    if two.misfit < best.misfit + np.log(MAX_FILTER_RATIO):
-        best = two
-    curved = _search(data, len(best.lags), 2, slope)
+    curved = _search(data, 2, slopes)
     if curved.misfit < best.misfit + np.log(MAX_DEGREE_RATIO):
         best = curved
 
@@ -283,146 +275,119 @@ def root_mean_square(values: Array) -> float:
     return float(np.sqrt((values**2).mean()))
 
 
-def _search(
-    data: Warming,
-    n_lags: int,
-    degree: int,
-    slope: float,
-) -> _Solution:
-    """Find the most likely time constants (lags) of the low-pass filters, and the coefficients.
-
-    The filters model how the elastomer's temperature lags behind the thermometer. The search begins
-    with the grid `LAGS_S`, which is refined around the best solution.
+def _search(data: Warming, degree: int, slope: Array) -> _Solution:
+    """Find the most likely longest time constant (lag) of the filters, and the coefficients.
 
     Args:
         data: Temperatures and pad stresses, averaged over blocks of 1 s.
-        n_lags: Number of low-pass filters.
         degree: Highest power of the filtered temperature in the fitted stress.
-        slope: Rms of the linear coefficients over the pads, in Pa/K; 0: not known yet.
+        slope: Linear coefficient of each pad (P,), in Pa/K; 0: not known yet.
     """
-
-    def find_best(choices: Iterable[tuple[float, ...]]) -> _Solution:
-        behind = _find_lags(data, list(choices))
-        solutions = (_solve(data, *choice, degree, slope) for choice in behind.items())
-        return min(solutions, key=lambda solution: solution.misfit)
-
-    best = find_best(itertools.combinations(LAGS_S[::-1].tolist(), n_lags))
-    step = LAGS_S[1] / LAGS_S[0]
-    while step > MAX_LAG_STEP:
-        near = itertools.product(*((lag / step, lag, lag * step) for lag in best.lags))
-        # Filters with nearly the same lag would have huge weights of opposite signs.
-        found = find_best(
-            lags for lags in near if all(a > 1.2 * b for a, b in itertools.pairwise(lags))
-        )
-        if found.misfit < best.misfit - 1e-4:
-            best = found
-        else:
-            step = step**0.5
-    return best
+    solutions = []
+    for longest in LAGS_S:
+        lags = longest / LAG_RATIO ** np.arange(N_FILTERS)
+        solutions.append(_solve(data, lags, degree, slope))
+    return min(solutions, key=lambda solution: solution.misfit)
 
 
-def _find_lags(
-    data: Warming,
-    choices: Sequence[tuple[float, ...]],
-) -> dict[tuple[float, ...], Array]:
-    """Return the measured temperature minus that after low-pass filters in series (N,), in K.
+def _find_lags(data: Warming, lags: Array) -> Array:
+    """Return the measured temperature minus that after each of L low-pass filters (N, L), in K.
 
     At the begin of each bag, both temperatures are equal.
 
     Args:
         data: Averages over N blocks of time.
-        choices: Sets of time constants of the filters, in s. Each is a key of the result.
+        lags: Time constants of the filters (L,), in s.
     """
-    times = sorted({lag for lags in choices for lag in lags})
     readings = np.column_stack([data.seconds, data.temperature])
     bags = np.split(readings, data.first[1:])
-    parts = [find_lags(bag[:, 0], bag[:, 1:], np.array(times)) for bag in bags]
-    single = dict(zip(times, np.concatenate(parts)[..., 0].T, strict=True))
-    return {
-        lags: filter_weights(np.array(lags)) @ np.array([single[lag] for lag in lags])
-        for lags in choices
-    }
+    parts = [find_lags(bag[:, 0], bag[:, 1:], lags) for bag in bags]
+    behind: Array = np.concatenate(parts)[..., 0]
+    return behind
 
 
 def _solve(
     data: Warming,
-    lags: tuple[float, ...],
-    behind: Array,
+    lags: Array,
     degree: int,
-    slope: float,
+    slope: Array,
 ) -> _Solution:
     """Fit the stress on each pad as a polynomial in the temperature of the elastomer.
 
     Args:
         data: Averages over blocks of time.
-        lags: Time constants, in s, of the low-pass filters that compute the temperature of the
-            elastomer, the longest first.
-        behind: Measured temperature minus temperature of the elastomer (N,), in K.
+        lags: Time constants of the low-pass filters (L,), in s, the longest first.
         degree: Degree of the polynomial.
-        slope: Rms of the linear coefficients over the pads, in Pa/K, for the weights of the blocks;
-            0: not known yet.
+        slope: Linear coefficient of each pad (P,), in Pa/K, for the weights of the blocks; 0: not
+            known yet.
     """
+    each_behind = _find_lags(data, lags)
+    behind = each_behind.mean(axis=1)
     u = data.temperature - data.temperature[0] - behind
-    start = np.exp(-data.seconds / lags[0])
-    columns = np.column_stack([*(u**d for d in range(degree + 1)), start])
-    weight = 1 / np.hypot(data.noise, LAG_ERROR * slope * behind)
+    columns = np.column_stack([*(u**d for d in range(degree + 1)), each_behind])
+    size = root_mean_square(slope)
+    weight = 1 / np.hypot(data.noise, LAG_ERROR * size * behind)
     weighted = columns * weight[:, None]
     normal = weighted.T @ weighted
-    # The prior of the last unknown states that, at the start, the temperature of the elastomer
-    # differs from the measured one by about 1 K.
-    start_deviation = START_KELVIN * max(slope, 1.0)
-    normal[-1, -1] += 1 / start_deviation**2
-    values = np.linalg.solve(normal, weighted.T @ (data.stress * weight[:, None]))
-    residual = data.stress - columns @ values
-    size = root_mean_square(residual * weight[:, None])
-    misfit = np.log(size) - np.log(weight).mean()
+    # The coefficients of the filters are about as large as the slope a priori.
+    of_filters = np.arange(degree + 1, len(normal))
+    normal[of_filters, of_filters] += 1 / max(size, 1.0) ** 2
+
+    def fit(stress: Array) -> tuple[Array, Array]:
+        """Return coefficients (K, n) and weighted residuals (N, n) of stresses (N, n)."""
+        wanted = stress * weight[:, None]
+        values = np.linalg.solve(normal, weighted.T @ wanted)
+        return values, wanted - weighted @ values
+
+    # The unknown initial difference between elastomer and thermometer is one number for all pads.
+    start = np.exp(-data.seconds / lags[0])[:, None]
+    values, rest = fit(data.stress)
+    start_values, start_rest = fit(start)
+    precision = float((start_rest**2).sum() * (slope @ slope)) + 1 / START_KELVIN**2
+    difference = float((start_rest.T @ rest @ slope).sum()) / precision
+    effect = difference * slope
+    values = values - start_values * effect
+    residual = data.stress - columns @ values - start * effect
+    weighted_residual = residual * weight[:, None]
+    scatter = np.sqrt((weighted_residual**2).mean(axis=0)).clip(1)
+    n_correlated = max(1.0, lags[-1] / BLOCK_S)
+    variance = n_correlated * np.diag(np.linalg.inv(normal))[1 : degree + 1]
+    misfit = np.log(root_mean_square(weighted_residual)) - np.log(weight).mean()
     return _Solution(
         lags,
         behind,
-        columns,
-        weight,
         values,
         residual,
+        np.outer(scatter, np.sqrt(variance)),
         float(misfit),
     )
 
 
 def _describe(data: Warming, best: _Solution) -> ThermalFit:
-    """Return the result of the fit, with the standard deviations of the coefficients.
+    """Return the result of the fit.
 
     Args:
         data: Temperatures and pad stresses, averaged over blocks of 1 s.
         best: Solution with the most likely time constants of the low-pass filters.
     """
-    lags, behind, columns, weight, values, residual, _ = best
+    lags, behind, values, residual, deviation, _ = best
     covariance = residual.T @ residual / max(float(behind @ behind), 1e-12)
     variances, directions = np.linalg.eigh(covariance)
     patterns = directions * np.sqrt(np.maximum(variances, 0))
     # `eigh` returns eigenvalues in rising order, so the largest errors come last.
     ramp = patterns[:, ::-1][:, :MAX_LAG_PATTERNS]
-
-    # The lags are uncertain, too. Each counts as one more unknown, whose column is the derivative
-    # of the filtered temperature with respect to the logarithm of the lag.
-    moved = [(*lags[:n], 1.05 * lag, *lags[n + 1 :]) for n, lag in enumerate(lags)]
-    shifts = [(behind - other) / 0.05 for other in _find_lags(data, moved).values()]
-    weighted = np.column_stack([columns, *shifts]) * weight[:, None]
-    inverse = np.linalg.pinv(weighted.T @ weighted)
-    block = (data.seconds // lags[0]).astype(int)
-    starts = np.flatnonzero(np.diff(block, prepend=-1))
-    scores = weighted[:, :, None] * (residual * weight[:, None])[:, None]
-    spread = inverse @ np.add.reduceat(scores, starts, axis=0)
-    size = np.sqrt((spread**2).sum(axis=0))
-
-    degrees = slice(1, columns.shape[1] - 1)
+    n_degrees = deviation.shape[1]
     sign = np.where(ramp[:, :1] < 0, -1.0, 1.0)
     model = ThermalModel(
         reference=np.array(round(float(data.temperature[0]), 3)),
-        lag=np.array(lags),
-        coefficient=values[degrees].T,
-        deviation=size[degrees].T * sign,
+        lag=lags,
+        coefficient=values[1 : n_degrees + 1].T,
+        deviation=deviation * sign,
         ramp=ramp,
+        lagging=values[n_degrees + 1 :].T,
     )
-    return ThermalFit(data, model, values[0], columns[:, 1], residual)
+    level = data.temperature - data.temperature[0] - behind
+    return ThermalFit(data, model, values[0], level, residual)
 
 
 def _check(

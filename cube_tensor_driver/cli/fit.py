@@ -181,12 +181,12 @@ def run_rest(options: argparse.Namespace) -> None:
     warming = read_warming(options.rest, options.cube)
     fits = {name: fit_thermal(data) for name, (_, data) in warming.items()}
     bags = " ".join(path.name for path in options.rest)
-    columns = ("lag, s", "degree", "before, Pa", "after, Pa", "deviation, Pa/K")
+    columns = ("longest lag, s", "degree", "before, Pa", "after, Pa", "deviation, Pa/K")
     rows = []
     for name, result in fits.items():
-        lags = " + ".join(f"{lag:.0f}" for lag in result.model.lag.tolist())
+        lag = f"{result.model.lag.max():.0f}"
         degree = str(result.model.coefficient.shape[1])
-        rows.append((name, lags, degree, *(f"{size:.2f}" for size in result.compute_sizes())))
+        rows.append((name, lag, degree, *(f"{size:.2f}" for size in result.compute_sizes())))
     print_table(("cube",), columns, rows)
     for name, result in fits.items():
         base, _ = warming[name]

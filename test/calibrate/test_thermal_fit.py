@@ -23,6 +23,7 @@ from cube_tensor_driver.config.calibration import find_shipped_calibration, read
 from cube_tensor_driver.config.skin import Elastomer
 from cube_tensor_driver.core.errors import FitError
 from cube_tensor_driver.core.layout import LAYOUTS
+from cube_tensor_driver.core.oscillator import TemperatureModel
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.reconstructor import Reconstructor
@@ -34,6 +35,8 @@ from cube_tensor_driver.simulation.imperfections import Imperfections
 from cube_tensor_driver.touch.contact_finder import ContactSettings, make_contact_finder
 
 CUBE = find_shipped_calibration(LAYOUTS["cube"])
+OSCILLATORS = TemperatureModel(np.array(25.0), np.full((24, 1), 1e-4))
+"""The mean drift of the simulated oscillators, as it was measured before they were embedded."""
 LOAD = np.array([-2e3, -1500.0, -5000.0, 0.0, 300.0, 0.0])  # Pa
 N_CUBES = 2
 
@@ -62,14 +65,14 @@ def play(cubes: SimulatedCubes, seconds: np.ndarray, load: np.ndarray):
         )
 
 
-def make_bag(folder, knots, faces="both", seconds=600.0, measured=True):
+def make_bag(folder, knots, faces="both", seconds=600.0, measured=True, base=CUBE):
     names = [f"c{k}" for k in range(N_CUBES)]
     skin = SimpleNamespace(
         name="skin",
         elastomer=None,
         frame=lambda cube: cube.name,
         cubes=[
-            SimpleNamespace(name=name, link="hub0", index=k, uid=0, calibration=CUBE)
+            SimpleNamespace(name=name, link="hub0", index=k, uid=0, calibration=base)
             for k, name in enumerate(names)
         ],
     )
@@ -77,7 +80,7 @@ def make_bag(folder, knots, faces="both", seconds=600.0, measured=True):
     with BagWriter(folder) as writer:
         for topic, kind in (("info", INFO), ("frequencies", FREQUENCIES)):
             writer.add_topic(f"/{topic}", kind, [quality(latched=topic == "info")])
-        info = info_of(skin, Pipeline([CUBE] * N_CUBES), START_NS)
+        info = info_of(skin, Pipeline([base] * N_CUBES), START_NS)
         writer.write("/info", START_NS, bytes(store.serialize_cdr(info, INFO)))
         times = np.arange(0.0, seconds, 0.5)
         cubes = simulated(knots, faces, None)
@@ -89,18 +92,21 @@ def make_bag(folder, knots, faces="both", seconds=600.0, measured=True):
     return folder
 
 
-@pytest.fixture(scope="module", params=["both", "ground"])
+@pytest.fixture(scope="module", params=["both", "ground", "both, with known oscillators"])
 def fitted(request, tmp_path_factory):
     """Calibrations that the command fits to one bag of 10 minutes."""
-    folder = tmp_path_factory.mktemp(request.param)
-    bag = make_bag(folder / "bag", ((30.0, 25.0), (60.0, 40.0)), request.param)
+    folder = tmp_path_factory.mktemp("fitted")
+    faces, *known = request.param.split(", ")
+    base = replace(CUBE, temperature=OSCILLATORS if known else None)
+    bag = make_bag(folder / "bag", ((30.0, 25.0), (60.0, 40.0)), faces, base=base)
     assert cli.main(["fit", "--rest", str(bag), "-o", str(folder / "warm.yaml")]) == 0
     assert (folder / "warm_c0.png").stat().st_size > 20_000
-    return request.param, [read_calibration(folder / f"warm_c{k}.yaml") for k in range(N_CUBES)]
+    return faces, [read_calibration(folder / f"warm_c{k}.yaml") for k in range(N_CUBES)]
 
 
-# Measured: zz 34, 14, 14 Pa of "both" and 30, 11, 9 Pa of "ground"; xx and yy 63 Pa at most.
-@pytest.mark.parametrize(("ramp", "zz"), [(60.0, 50.0), (300.0, 25.0), (900.0, 16.0)])
+# Measured: zz 13, 13, 12 Pa of "both", 9, 9, 8 Pa of "ground", and 13, 6, 3 Pa with known
+# oscillators; xx and yy 12 Pa, gradients 10 Pa at most.
+@pytest.mark.parametrize(("ramp", "zz"), [(60.0, 16.0), (300.0, 15.0), (900.0, 15.0)])
 def test_15_kelvin_under_a_lasting_load_leave_little(fitted, ramp, zz):
     faces, calibrations = fitted
     warm = ((30.0, 25.0), (30.0 + ramp, 40.0))
@@ -110,12 +116,15 @@ def test_15_kelvin_under_a_lasting_load_leave_little(fitted, ramp, zz):
     errors, uncorrected, bits = [], [], []
     for rows in play(simulated(warm, faces, 0.0), times, LOAD):
         found = reconstruct.process(rows)
-        errors.append(found.stress - LOAD)
+        gradient = found.gradient * CUBE.half_side
+        errors.append(np.hstack([found.stress - LOAD, gradient]))
         bits.append(found.status)
         uncorrected.append(plain.process(rows).stress - LOAD)
     worst = np.abs(errors).max(axis=(0, 1))
-    assert worst[2] < zz and worst[:2].max() < 150
-    assert np.abs(uncorrected).max(axis=(0, 1))[:3].min() > 900
+    if calibrations[0].temperature is not None and ramp > 60.0:
+        zz = 8.0
+    assert worst[2] < zz and worst[:6].max() < 16 and worst[6:].max() < 14
+    assert np.abs(uncorrected).max(axis=(0, 1))[:2].min() > 900
     # The fastest ramp is stated as uncertain while it lasts; long after it, nothing is.
     bits = np.array(bits)
     if ramp == 60.0:
@@ -124,12 +133,13 @@ def test_15_kelvin_under_a_lasting_load_leave_little(fitted, ramp, zz):
         assert (bits[-10:] & (COMPENSATION | THERMAL) == THERMAL).all()
 
 
-def test_the_deviation_states_the_error_of_ramps(fitted):
+@pytest.mark.parametrize("ramp", [60.0, 900.0])
+def test_the_deviation_states_the_error_of_ramps(fitted, ramp):
     """After 20 minutes at rest, so that the unknown start is forgotten."""
     faces, calibrations = fitted
-    warm = ((1200.0, 25.0), (1260.0, 40.0))
+    warm = ((1200.0, 25.0), (1200.0 + ramp, 40.0))
     reconstruct = Reconstructor(calibrations, np.float64)
-    times = np.concatenate([np.arange(0.0, 1200.0, 2.0), np.arange(1200.0, 1800.0, 2.0)])
+    times = np.arange(0.0, 1800.0 + ramp, 2.0)
     errors, stated = [], []
     for rows in play(simulated(warm, faces, 0.0), times, np.zeros(6)):
         stress = reconstruct.process(rows).stress
@@ -138,8 +148,9 @@ def test_the_deviation_states_the_error_of_ramps(fitted):
             grown = [reconstruct.covariance(k) - reconstruct.pipeline.covariance(k) for k in (0, 1)]
             stated.append([np.diag(one)[:3] for one in grown])
     ratio = np.sqrt((np.array(errors) ** 2).mean(axis=(0, 1)) / np.mean(stated, axis=(0, 1)))
-    # Measured: 0.65 to 0.90; the lags count as unknown for each pad, which overstates.
-    assert (ratio > 0.5).all() and (ratio < 1.2).all()
+    # Measured: 0.68 to 1.11 of "both"; of "ground" 0.18 to 0.41 (60 s, errors of at most 2 Pa) and
+    # 1.0 to 2.4 (900 s, 8 Pa).
+    assert (ratio > 0.15).all() and (ratio < (1.2 if faces == "both" else 2.5)).all()
 
 
 @pytest.mark.parametrize("tared", [False, True])
@@ -160,7 +171,7 @@ def test_a_fast_ramp_is_no_contact_and_hides_none(fitted, tared):
     offset = poses.position[:, :2] - centre
     by_force = finder._inverse.contact_response.response(offset, flat, flat, 2e-3)[:, :, 2]
     pressed = -by_force / np.where(np.arange(15) < 6, 1.0, 2e-3)  # 1 N, Pa and Pa/m
-    reconstruct, times, false = Reconstructor(calibrations), np.arange(0.0, 260.0, 2.0), 0
+    reconstruct, times = Reconstructor(calibrations), np.arange(0.0, 260.0, 2.0)
     if tared:
         times = np.union1d(times, np.linspace(20, 30, 1001)[:-1])
     cubes = simulated(((30.0, 25.0), (90.0, 40.0)), faces, None)
@@ -175,29 +186,31 @@ def test_a_fast_ramp_is_no_contact_and_hides_none(fitted, tared):
         errors = reconstruct.errors(np.arange(N_CUBES), found.left_out)[which]
         if time < 200.0:
             blind.update(time, values, left_out, 0 * status)
-            false += len(blind.contacts)
             finder.update(time, values, left_out, status)
             informed.update(time, values, left_out, status, errors=errors)
-            assert not finder.contacts and not informed.contacts
+            assert not blind.contacts and not finder.contacts and not informed.contacts
         else:
             finder.update(time, values + pressed, left_out, status)
             informed.update(time, values + pressed, left_out, status, errors=errors)
             assert len(finder.contacts) == len(informed.contacts) == 1
-    # Measured: 1.12 and 1.21 N, 1.13 and 1.37 N after a tare, and at most 2.6 mm off.
+    # Measured: 0.994 to 1.019 N, and at most 0.07 mm off.
     (contact,) = finder.contacts
-    assert contact.normal_force == pytest.approx(1.0, rel=0.45 if tared else 0.25)
-    assert np.linalg.norm(contact.position[:2] - centre) < 3e-3
-    # With the errors of the compensation. Measured: at most 0.9 and 1.2 standard deviations, which
-    # are up to 0.066 N and 0.41 mm.
+    assert contact.normal_force == pytest.approx(1.0, rel=0.03)
+    assert np.linalg.norm(contact.position[:2] - centre) < 1.5e-4
+    # With the errors of the compensation. Measured: at most 1.6 and 2.0 standard deviations, which
+    # are up to 0.008 N and 0.016 mm.
     (contact,) = informed.contacts
     off = np.linalg.norm(contact.position[:2] - centre)
-    assert abs(contact.normal_force - 1.0) < 3 * contact.force_uncertainty < 0.3
-    assert off < 4 * contact.position_uncertainty < 2e-3
-    assert (false > 10) == (faces == "ground")
+    assert abs(contact.normal_force - 1.0) < 3 * contact.force_uncertainty < 0.03
+    assert off < 4 * contact.position_uncertainty < 1e-4
 
 
-def test_a_known_lag_and_slope_are_recovered():
-    """One filter, exactly: u = r (t - lag (1 - exp(-t / lag))) while it warms by r per second."""
+@pytest.mark.parametrize("start", [0.0, 1.0])
+def test_a_known_lag_and_slope_are_recovered(start):
+    """One filter, exactly: u = r (t - lag (1 - exp(-t / lag))) while it warms by r per second.
+
+    The elastomer may be warmer than the thermometer at the start, in K.
+    """
     rate, lag, ramp = 0.25, 140.0, 60.0
     t = np.arange(600.0) + 0.5
     since = np.maximum(t - 30.0, 0)
@@ -205,16 +218,17 @@ def test_a_known_lag_and_slope_are_recovered():
     def rising(s):
         return rate * (s + lag * np.expm1(-s / lag))
 
-    u = rising(since) - rising(np.maximum(since - ramp, 0))
+    u = rising(since) - rising(np.maximum(since - ramp, 0)) + start * np.exp(-t / lag)
     temperature = 20 + rate * np.minimum(since, ramp)
     slope = np.linspace(-200.0, 180.0, 24)
     noise = 0.3
     stress = 5.0 + u[:, None] * slope + noise * np.random.default_rng(2).normal(size=(600, 24))
     fit = fit_thermal(Warming("bag: cube c0", t, (0,), temperature, stress, noise))
-    assert fit.model.lag == pytest.approx([lag], rel=0.01)
-    np.testing.assert_allclose(fit.model.coefficient[:, 0], slope, rtol=0.005, atol=0.3)
-    # Offset and unknown start are told apart by the 30 s before the ramp alone.
-    np.testing.assert_allclose(fit.offset, 5.0, atol=4.0)
+    # None of the filters has this lag, but their mixture does what it does. Measured: 1.9 Pa.
+    np.testing.assert_allclose(fit.model.coefficient[:, 0], slope, rtol=0.01, atol=0.3)
+    assert np.abs(fit.residual[60:]).max() < 2.5
+    # The 30 s before the ramp tell the offset from the unknown start, which all pads share.
+    np.testing.assert_allclose(fit.offset, 5.0, atol=1.0)
 
 
 def test_a_ramp_that_does_not_tell_lag_from_slope_is_refused():

@@ -79,6 +79,19 @@ def test_no_stress_is_left_whatever_the_intervals(lag):
     assert np.abs(plain.stress[:, 0]).max() > 1000
 
 
+def test_each_pad_has_its_own_mixture_of_filters():
+    lags = [97.0, 21.0, 5.0]
+    lagging = np.random.default_rng(4).normal(scale=150.0, size=(8, 3))
+    one = calibration(lags, lagging=lagging)
+    outputs = np.column_stack([reading(UNEVEN, [lag]) for lag in lags])
+    measured = np.interp(UNEVEN, *KNOTS) - 25
+    stress = np.outer(outputs.mean(axis=1), LINEAR) + (measured[:, None] - outputs) @ lagging.T
+    hertz = pad_frequency(stress, one.rest_frequency, one.beta, one.modulus)
+    rows = replace(unloaded(UNEVEN, lags), frequency=hertz)
+    found = Reconstructor([one, calibration([50.0])], np.float64).process(rows).stress
+    np.testing.assert_allclose(found[:, [0, 2, 4]], 0, atol=2e-3)
+
+
 def test_parts_and_a_restored_state_give_the_same_bits():
     rows = unloaded(np.sort(np.concatenate([UNEVEN, np.linspace(102, 590, 50)])), [97.0, 21.0])
     whole, parts = (Reconstructor([calibration([97.0, 21.0])]) for _ in range(2))

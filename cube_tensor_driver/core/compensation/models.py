@@ -174,20 +174,25 @@ class ThermalModel(EffectModel):
     """Stress, in Pa, that each pad of a cube in the skin measures without load, over temperature.
 
     It contains the drift of the electronics and the thermal stress that the expansion of the
-    elastomer causes, both including the gains (relative sensitivities) of the pads. Pad p measures
-    sum_d coefficient_pd u^d, d = 1, 2, ..., where u is the temperature of the elastomer minus
-    `reference`. The elastomer lags behind the thermometer, so its temperature is computed from the
-    measured one by low-pass filters.
+    elastomer causes, both including the gains (relative sensitivities) of the pads. The elastomer
+    lags behind the thermometer. Pad p measures::
+
+        sum_d coefficient_pd u^d + sum_l lagging_pl (T - x_l),      d = 1, 2, ...
+
+    T is the measured temperature and x_l the output of low-pass filter l. u is the mean of x_l
+    minus `reference`, or, without `lagging`, the output of the filters in series minus `reference`.
 
     Attributes:
         reference: Temperature, in °C, at which the rest frequencies of the calibration hold.
-        lag: Time constants (L,), in s, of low-pass filters in series, all different; 0: no lag.
+        lag: Time constants (L,), in s, of low-pass filters, all different; 0: no lag.
         coefficient: Coefficients of each pad (P, D), in Pa/K^d, the linear term first.
         deviation: Standard deviations of `coefficient` (P, D). The errors of all pads in a column
             are fully correlated; pads with equal signs err in the same direction. None: unknown.
         ramp: Errors of the pads' stresses by K independent causes (P, K), each with the size of one
             standard deviation, in Pa per K of difference between the measured and the filtered
             temperature; None: they are not known.
+        lagging: Coefficients of each pad and filter (P, L), in Pa/K; None: the filters are in
+            series.
     """
 
     key = "thermal"
@@ -197,6 +202,7 @@ class ThermalModel(EffectModel):
         "coefficient": "PD",
         "deviation": "PD",
         "ramp": "PK",
+        "lagging": "PL",
     }
 
     reference: Array
@@ -204,6 +210,7 @@ class ThermalModel(EffectModel):
     coefficient: Array
     deviation: Array | None = None
     ramp: Array | None = None
+    lagging: Array | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -2,13 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compensation of temperature: thermal stress and drift of the pads, with the lag of the elastomer.
 
-The temperature u of the elastomer lags behind the temperature T that the thermometer of the hub
-measures. u is T after first-order low-pass filters in series with the time constants lag_i. It is
-computed as a weighted sum of the outputs x_i of the same filters in parallel (`low_pass.py`)::
+The elastomer lags behind the temperature T that the thermometer of the hub measures. Its
+temperature u is a weighted sum of the outputs x_i of first-order low-pass filters in parallel
+(`low_pass.py`)::
 
-    lag_i dx_i/dt = T - x_i,      u = sum_i w_i x_i,      w_i = prod_j lag_i / (lag_i - lag_j)
+    lag_i dx_i/dt = T - x_i,      u = sum_i w_i x_i
 
-The product is over all j other than i. A row is one sample of one cube, C the number of cubes of
+If a model states how each pad depends on T - x_i (`ThermalModel.lagging`), u is the mean of x_i.
+Otherwise it is T after the filters in series, with w_i = prod_j lag_i / (lag_i - lag_j), where the
+product is over all j other than i. A row is one sample of one cube, C the number of cubes of
 the skin, P the largest number of pads of a cube.
 """
 
@@ -70,8 +72,11 @@ class Thermal:
         lag = np.maximum(tabulate(models, "lag", (0,)), MIN_LAG_S)
         weight = np.zeros_like(lag)
         for cube, model in enumerate(models):
-            n_lags = 0 if model is None else len(model.lag)
-            weight[cube, :n_lags] = filter_weights(lag[cube, :n_lags])
+            if model is not None:
+                n_lags = len(model.lag)
+                in_series = model.lagging is None
+                own = filter_weights(lag[cube, :n_lags]) if in_series else 1 / n_lags
+                weight[cube, :n_lags] = own
         self._filters = LowPass(lag.T, weight.T[..., None])
         self._reference = tabulate(models, "reference", ())
         # Attributes of the models as tables: coefficients and their deviations (C, P, degree), in
@@ -93,6 +98,8 @@ class Thermal:
             np.inf,
         )
         self._relative = np.moveaxis(self._coefficient, 2, 0)[::-1] / stiffness
+        lagging = tabulate(models, "lagging", (n_pads, 0))
+        self._relative_lagging = np.moveaxis(lagging, 2, 0) / stiffness
         self._endless = np.full(n_cubes, np.inf)
 
         # Time stamp of each cube's row in the last step, in ns, and the last measured temperature,
@@ -166,6 +173,10 @@ class Thermal:
         for coefficient in self._relative:
             self.offset += coefficient
             self.offset *= level[:, None]
+        for coefficient, behind_filter in zip(
+            self._relative_lagging, self._filters.lag, strict=False
+        ):
+            self.offset += coefficient * behind_filter
         behind = np.abs(self._measured - temperature)
         deviation = self._ramp_size * behind + self._linear_size * self._unknown
         # The comparison is false for NaN, which means that no temperature has been measured so far.

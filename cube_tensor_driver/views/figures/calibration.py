@@ -214,12 +214,11 @@ def draw_thermal_fit(fit: ThermalFit) -> Figure:
         label="thermometer of the hub",
     )
     elastomer = fit.level + float(fit.model.reference)
-    lags = " + ".join(f"{lag:.0f} s" for lag in fit.model.lag.tolist())
     warm.plot(
         time,
         elastomer,
         "C3--",
-        label=f"elastomer, lag {lags}",
+        label=f"mean of {len(fit.model.lag)} low-pass filters, up to {fit.model.lag.max():.0f} s",
     )
     warm.set(ylabel="temperature / °C")
     warm.legend(fontsize=7)
