@@ -10,15 +10,20 @@ import os
 import socket
 import subprocess
 import sys
+from contextlib import nullcontext
+from types import SimpleNamespace
 
 import pytest
 
-from conftest import ROOT
+from conftest import ROOT, encoded, stamped
 
 pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 
+from cube_tensor_driver.messages.codec import frequency_codec
+from cube_tensor_driver.msg import SkinFrequencies
 from cube_tensor_driver.processes import domain
 from workshop.torture.mutations import MUTATIONS, edit_source
+from workshop.torture.recorder import TopicLog
 from workshop.torture.torture import LIMITS, find_failures
 
 
@@ -109,6 +114,28 @@ def test_a_torture_has_a_domain_of_its_own(monkeypatch):
             with domain.own_domain() as third:
                 assert third < other - 1
     assert os.environ["ROS_DOMAIN_ID"] == "42"
+
+
+def test_faults_wait_for_every_cube():
+    """On a busy machine, two scans of one of two hubs came as one message, of as many rows as there
+    are cubes. Faults then hit the first samples of the other hub, which nobody can count."""
+    messages = []
+
+    info = {"publication_sequence_number": 1, "source_timestamp": 0}
+
+    def take_message(*_):
+        return (messages.pop(), info) if messages else None
+
+    handle = nullcontext()
+    handle.take_message = take_message
+    node = SimpleNamespace(create_subscription=lambda *_, **__: SimpleNamespace(handle=handle))
+    skin = SimpleNamespace(parent_frame="skin", cubes=range(4))
+    log = TopicLog(node, SkinFrequencies, "frequencies", None, frequency_codec, skin)
+    assert not log.has_every_cube()
+    for cubes, is_complete in (([0, 1, 0, 1], False), ([0, 1, 2, 3], True), ([2, 3], False)):
+        messages.append(encoded(stamped(cubes, [[1.0]] * len(cubes), 0, 1), b"skin\0"))
+        log.take()
+        assert log.has_every_cube() == is_complete, cubes
 
 
 def test_limits_of_the_figures():

@@ -116,11 +116,9 @@ def play(
             )
             actions.start_driver(ports / FAULT_PIPE)
             begin_ns = time.time_ns()
-            # Faults begin only when every cube delivers.
-            observer.spin(
-                MAX_START_S,
-                lambda: stress.count > 0 and len(stress.decode_newest_rows()) == len(skin.cubes),
-            )
+            # Faults begin only when every cube delivers: the driver counts the samples of a hub that
+            # are lost from the first one that arrives.
+            observer.spin(MAX_START_S, stress.has_every_cube)
             if not stress.count:
                 logs = "\n".join(children.log(name)[-500:] for name in NODES)
                 raise CubeError(f"no tensor arrived within {MAX_START_S:g} s:\n{logs}")

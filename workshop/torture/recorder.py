@@ -96,6 +96,7 @@ class TopicLog(Generic[AnyRows]):
         self._kind = kind
         self._codec: MessageCodec[AnyRows] = codec
         self._frame_id = skin.parent_frame.encode() + b"\0"
+        self._n_cubes = len(skin.cubes)
         self._subscription: Any = node.create_subscription(
             kind,
             topic,
@@ -146,6 +147,16 @@ class TopicLog(Generic[AnyRows]):
     def decode_newest_rows(self) -> AnyRows:
         """Return the rows of the newest message; there must be one."""
         return self._codec.decode(self._messages[-1].data).rows
+
+    def has_every_cube(self) -> bool:
+        """Return whether the newest message has rows of every cube.
+
+        The number of rows does not tell: a message can hold several scans of a few hubs.
+        """
+        if not self._messages:
+            return False
+        cubes = np.unique(self.decode_newest_rows().cube)
+        return len(cubes) == self._n_cubes
 
     def received(self) -> Received[AnyRows]:
         """Return the rows (one cube at one sampling time each) of all messages.
