@@ -19,7 +19,7 @@ from ...messages.skin_info import (
     read_cube_poses,
     read_skin_elastomer,
 )
-from ...messages.touch import make_touch_message
+from ...messages.touch import encode_touch
 from ...messages.types import CONTACTS, TOUCH, TRACTION
 from ...touch.contact_finder import ContactSettings, make_contact_finder
 from ...touch.touch_detection import NO_TOUCHES, Touch, Touches
@@ -139,16 +139,8 @@ class ContactWriter:
         """
         touches = self._touch(rows)
         for found in touches:
-            message = make_touch_message(
-                make_message,
-                self._frame_id,
-                found,
-            )
-            self._writer.write(
-                self._touches,
-                recorded_ns,
-                serialise(TOUCH, message),
-            )
+            data = encode_touch(self._frame_id, found)
+            self._writer.write(self._touches, recorded_ns, data)
         errors = self._stress_errors.update(rows, stamp_ns)
         if errors is not None:
             self._errors = errors.astype(float)

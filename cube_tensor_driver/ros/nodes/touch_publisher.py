@@ -6,19 +6,16 @@ from __future__ import annotations
 
 import struct
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
 from typing import TYPE_CHECKING
 
 from rclpy.qos import QoSProfile
-from rclpy.serialization import serialize_message
 
 from ...config.skin import Skin
 from ...core.reconstructor import Reconstructor
 from ...core.rows import StressRows
 from ...messages.codec import SECOND
-from ...messages.touch import make_touch_message
+from ...messages.touch import encode_touch
 from ...msg import SkinTouch
-from ..messages import make_message
 from ..node import CubeNode
 
 if TYPE_CHECKING:
@@ -64,11 +61,6 @@ class TouchPublisher:
         self._reconstructor = reconstructor
         self._worker = ThreadPoolExecutor(1)
         self._future: Future[Touch] | None = None
-        self._make_message = partial(
-            make_touch_message,
-            make_message,
-            skin.parent_frame,
-        )
         self._publisher = node.own(node.create_lifecycle_publisher(SkinTouch, "touch", profile))
         self._rest_changes = 0
 
@@ -79,7 +71,7 @@ class TouchPublisher:
 
         # Most messages contain no touch and differ only in their stamps, so such a message is
         # serialised once, and later only its stamp is replaced.
-        self._empty = bytearray(serialize_message(self._make_message(NO_TOUCHES)))
+        self._empty = bytearray(encode_touch(self._skin.parent_frame, NO_TOUCHES))
         return Touch(
             self._skin,
             self._false_alarms,
@@ -106,7 +98,7 @@ class TouchPublisher:
             touch.restart()
         for touches in touch(rows):
             if len(touches.cube):
-                self._publisher.publish(self._make_message(touches))
+                self._publisher.publish(encode_touch(self._skin.parent_frame, touches))
             else:
                 seconds, nanoseconds = divmod(touches.stamp_ns, SECOND)
                 STAMP.pack_into(
