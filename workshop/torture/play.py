@@ -116,8 +116,8 @@ def play(
             )
             actions.start_driver(ports / FAULT_PIPE)
             begin_ns = time.time_ns()
-            # Faults begin only when every cube delivers: the driver counts the samples of a hub that
-            # are lost from the first one that arrives.
+            # Faults begin only when every cube delivers, because the driver counts the lost samples
+            # of a hub from the first one that arrives.
             observer.spin(MAX_START_S, stress.has_every_cube)
             if not stress.count:
                 logs = "\n".join(children.log(name)[-500:] for name in NODES)
