@@ -7,7 +7,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from ..config.skin import Elastomer
 from ..core.calibration import Calibration
+from ..core.defaults import SURFACE_DEPTH
 from ..core.modes import COMPONENTS
 from ..core.poses import CubePoses
 from ..touch.surface import Surface
@@ -46,7 +48,7 @@ class ShownSkin:
         names: Sequence[str],
         poses: CubePoses,
         calibrations: Sequence[Calibration],
-        depth: float,
+        elastomer: Elastomer | None,
     ) -> None:
         """Prepare the points of the field and the 3-D view of the skin.
 
@@ -55,12 +57,14 @@ class ShownSkin:
             names: Names of its N cubes.
             poses: Poses of its cubes in the parent frame, in m.
             calibrations: Calibration of each cube.
-            depth: Distance from the centres of the cubes to the surface of the skin, in m.
+            elastomer: Elastomer that the skin file states, for the depth of the cubes below the
+                surface; None: the cubes have the default depth.
         """
         # A large skin gets fewer points per cube, so that all have about `MAX_SURFACE_POINTS`.
         points_per_side = (MAX_SURFACE_POINTS / len(names)) ** 0.5
         points_per_side = min(max(points_per_side, 2), MAX_POINTS_PER_SIDE)
         self.name, self.names = name, list(names)
+        depth = elastomer.depth if elastomer else SURFACE_DEPTH
         self.surface = Surface(poses, depth, int(points_per_side))
         self.field = FieldModel(self.surface, calibrations)
         self.scene = Scene(names, poses, self.surface)

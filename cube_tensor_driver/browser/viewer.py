@@ -31,7 +31,7 @@ from ..core.defaults import CONTACT_PRESSURE
 from ..core.latest_stress import STALE, STALE_S
 from ..core.rows import StressRows
 from ..messages.contacts import decode_contacts, decode_traction
-from ..messages.skin_info import read_cube_calibrations
+from ..messages.skin_info import read_cube_calibrations, read_skin_elastomer
 from ..msg import SkinContacts
 from ..processes.stop_signals import stop_event
 from ..ros.callbacks import CallbackErrors
@@ -101,7 +101,6 @@ class Viewer:
         node: Node,
         host: str,
         port: int,
-        depth: float,
         recordings: Path,
     ) -> None:
         """Start the web server and subscribe to the topics of the skin.
@@ -110,7 +109,6 @@ class Viewer:
             node: Node of this process.
             host: Name or IP address on which the server listens.
             port: TCP port of the page; if it is in use, the next free one is taken.
-            depth: Distance from the centres of the cubes to the surface of the skin, in metres.
             recordings: Folder for the bags that are recorded from the page.
 
         Raises:
@@ -134,7 +132,6 @@ class Viewer:
         self._gate = Gate(host, port, self._token, inner)
         # viser warns if a browser disconnects while its picture is made, which is no fault.
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
-        self._depth = depth
         self._callback_errors = CallbackErrors(node)
         self._subscriber = SkinSubscriber(
             node,
@@ -237,7 +234,7 @@ class Viewer:
             names,
             skin.poses,
             calibrations,
-            self._depth,
+            read_skin_elastomer(skin.info),
         )
         self._scans = ScanSynchronizer(len(names))
         self._history = History(round(HISTORY_S / PICTURE_PERIOD_S))
@@ -370,7 +367,6 @@ def make_scan(
 def run_view(
     host: str,
     port: int,
-    depth: float,
     recordings: Path,
 ) -> int:
     """Serve the page until Ctrl-C.
@@ -378,7 +374,6 @@ def run_view(
     Args:
         host: Name or IP address on which the server listens.
         port: TCP port of the page; if it is in use, the next free one is taken.
-        depth: Distance from the centres of the cubes to the surface of the skin, in metres.
         recordings: Folder for the bags that are recorded from the page.
 
     Returns:
@@ -390,15 +385,7 @@ def run_view(
     stop = stop_event()
     with (
         run_node_session("view") as (node, executor),
-        contextlib.closing(
-            Viewer(
-                node,
-                host,
-                port,
-                depth,
-                recordings,
-            )
-        ) as viewer,
+        contextlib.closing(Viewer(node, host, port, recordings)) as viewer,
     ):
         print(f"{viewer.url}  (Ctrl-C ends it)", flush=True)
         spin_until(

@@ -59,11 +59,7 @@ def add_arguments(parser: Parser) -> None:
         required=True,
         help="skin file to write",
     )
-    parser.add_argument(
-        "--name",
-        default="skin",
-        help="name of the skin (default: %(default)s)",
-    )
+    parser.add_value("--name", "NAME", "name of the skin (default: %(default)s)", default="skin")
     parser.add_value(
         "--calibration",
         "FILE",

@@ -29,15 +29,12 @@ def add_arguments(parser: Parser) -> None:
         "--links", "N", "hubs that share the cubes (default: %(default)s)", count, default=1
     )
     grid.add_rate()
-    grid.add_argument(
-        "--name",
-        default="skin",
-        help="name of the skin (default: %(default)s)",
-    )
-    grid.add_argument(
+    grid.add_value("--name", "NAME", "name of the skin (default: %(default)s)", default="skin")
+    grid.add_value(
         "--port",
+        "PORT",
+        "ports; {} is the number of the link (default: %(default)s)",
         default="/dev/ttyACM{}",
-        help="ports; {} is the number of the link (default: %(default)s)",
     )
     grid.add_value(
         "--layout", "NAME", "layout of the cubes (default: %(default)s)", default="planar"

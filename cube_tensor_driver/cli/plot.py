@@ -14,21 +14,11 @@ def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
     parser.add_bag()
     parser.add_value("--cube", "NAME", "which cube (default: the first)")
-    parser.add_argument(
-        "--from",
-        type=number,
-        metavar="S",
-        help="begin S seconds after the start of the bag",
-        dest="start",
-        default=0.0,
+    parser.add_value(
+        "--from", "S", "begin S seconds after the start of the bag", number, default=0.0
     )
-    parser.add_argument(
-        "--to",
-        type=number,
-        metavar="S",
-        help="end S seconds after the start of the bag",
-        dest="end",
-        default=math.inf,
+    parser.add_value(
+        "--to", "S", "end S seconds after the start of the bag", number, default=math.inf
     )
     parser.add_output(
         "-o",
@@ -49,8 +39,9 @@ def run(options: argparse.Namespace) -> int:
         series = read_cube_series(
             source,
             options.cube,
-            options.start,
-            options.end,
+            # `from` is a keyword of Python.
+            getattr(options, "from"),
+            options.to,
         )
     save(draw_series(series, options.bag.resolve().name), options.output)
     print(f"wrote {options.output}: cube {series.name}, {len(series.seconds)} samples")

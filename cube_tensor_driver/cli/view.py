@@ -7,8 +7,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ..core.defaults import SURFACE_DEPTH
-from .parser import Parser, positive, tcp_port
+from .parser import Parser, tcp_port
 
 RECORDINGS = Path("~/cube_recordings")
 """Default folder for the bags that users record from the page; --recordings names another one."""
@@ -31,13 +30,6 @@ def add_arguments(parser: Parser) -> None:
         default=8080,
     )
     parser.add_value(
-        "--depth",
-        "M",
-        "depth of the cubes below the surface, m (default: %(default)s)",
-        positive,
-        default=SURFACE_DEPTH,
-    )
-    parser.add_value(
         "--recordings",
         "DIR",
         "folder for the bags that are recorded from the page (default: %(default)s)",
@@ -54,6 +46,5 @@ def run(options: argparse.Namespace) -> int:
     return run_view(
         options.host,
         options.port,
-        options.depth,
         options.recordings.expanduser(),
     )

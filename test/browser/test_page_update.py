@@ -27,9 +27,11 @@ from websockets.sync.client import connect
 from conftest import encoded
 from cube_tensor_driver.browser import page as page_module
 from cube_tensor_driver.browser.page import LEFT_WIDTH, RIGHT_WIDTH, Page, PageLayout
+from cube_tensor_driver.browser.update import ShownSkin
 from cube_tensor_driver.browser.viewer import MAX_STEP_S, Viewer
 from cube_tensor_driver.config.package_data import find_package_data
-from cube_tensor_driver.config.skin import read_skin
+from cube_tensor_driver.config.skin import Elastomer, read_skin
+from cube_tensor_driver.core.defaults import SURFACE_DEPTH
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import StressRows
 from cube_tensor_driver.messages.contacts import encode_contacts, make_traction_message
@@ -207,7 +209,7 @@ def page(ros, tmp_path) -> Iterator[SimpleNamespace]:
     """The view in this process, a reader of its page, and a source of scans."""
     node, executor = rclpy.create_node("view"), make_executor()
     executor.add_node(node)
-    view = Viewer(node, HERE, 0, 0.004, tmp_path)
+    view = Viewer(node, HERE, 0, tmp_path)
     stop = threading.Event()
     spin = partial(spin_until, executor, stop.is_set, step_s=MAX_STEP_S, on_step=view.step)
     spinning = threading.Thread(target=spin)
@@ -247,6 +249,12 @@ def test_all_that_a_browser_receives_at_once_is_of_one_scan(page, ros):
         assert state.colour == scene.convert_to_linear_light(colour)[0].tolist()
     # viser applies at most 128 messages at once.
     assert max(page.reader.windows) < 128
+
+
+def test_the_surface_is_where_the_skin_file_states_it():
+    for elastomer, depth in ((None, SURFACE_DEPTH), (Elastomer(5e-3, 11e-3), 5e-3)):
+        shown = ShownSkin("skin", SKIN.names, SKIN.poses, SKIN.calibrations, elastomer)
+        assert shown.surface.depth == depth
 
 
 def test_a_paused_page_stays_and_only_follows_the_choices_of_its_user(page, ros):
