@@ -33,7 +33,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -125,6 +124,7 @@ class ThermalFit:
         offset: Stress on each pad (P,) at the reference temperature, in Pa.
         level: Temperature of the elastomer (N,), in K above the reference.
         residual: Measured minus fitted stresses (N, P), in Pa.
+        misfit: Negative logarithm of the likelihood per stress, without constants.
     """
 
     data: Warming
@@ -132,6 +132,7 @@ class ThermalFit:
     offset: Array
     level: Array
     residual: Array
+    misfit: float
 
     def compute_sizes(self) -> tuple[float, float, float]:
         """Return the rms effect on the pads, before and after compensation, and the uncertainty.
@@ -168,27 +169,6 @@ class ThermalFit:
             thermal=self.model,
             source=source,
         )
-
-
-class _Solution(NamedTuple):
-    """Solution by weighted least squares for given time constants and degree of the polynomial.
-
-    Attributes:
-        lags: Time constants of the low-pass filters (L,), in s, the longest first.
-        behind: How far the mean filtered temperature u lags behind the measured one (N,), in K.
-        values: Fitted coefficients of each pad (K, P): those of 1, u, ..., u^degree, and of how far
-            each filter's output lags behind.
-        residual: Measured minus fitted stresses (N, P), in Pa.
-        deviation: Standard deviations of the coefficients of u, ..., u^degree (P, degree).
-        misfit: Negative logarithm of the likelihood per stress, without constants.
-    """
-
-    lags: Array
-    behind: Array
-    values: Array
-    residual: Array
-    deviation: Array
-    misfit: float
 
 
 def read_warming(
@@ -253,21 +233,21 @@ def fit_thermal(data: Warming) -> ThermalFit:
             f"{data.name}: {len(data.seconds)} s in which the temperature varies by {span:.2g} K; "
             f"{MIN_BLOCKS} s and {MIN_RANGE:g} K are needed: record while the skin warms or cools"
         )
-    slopes = _search(data, 1, np.zeros(data.stress.shape[1])).values[1]
+    unweighted = _search(data, 1, np.zeros(data.stress.shape[1]))
+    slopes = unweighted.model.coefficient[:, 0]
     slope = root_mean_square(slopes)
     best = _search(data, 1, slopes)
     # In `best`, the weight of a block depends on the difference between its temperatures before and
     # after the low-pass filter. If these weights change the slope much, the data do not determine
     # it, and `_check` raises an error.
-    change = abs(root_mean_square(best.values[1]) / slope - 1)
+    change = abs(root_mean_square(best.model.coefficient[:, 0]) / slope - 1)
 
     curved = _search(data, 2, slopes)
     if curved.misfit < best.misfit + np.log(MAX_DEGREE_RATIO):
         best = curved
 
-    result = _describe(data, best)
-    _check(result, slope, change)
-    return result
+    _check(best, slope, change)
+    return best
 
 
 def root_mean_square(values: Array) -> float:
@@ -275,7 +255,7 @@ def root_mean_square(values: Array) -> float:
     return float(np.sqrt((values**2).mean()))
 
 
-def _search(data: Warming, degree: int, slope: Array) -> _Solution:
+def _search(data: Warming, degree: int, slope: Array) -> ThermalFit:
     """Find the most likely longest time constant (lag) of the filters, and the coefficients.
 
     Args:
@@ -311,7 +291,7 @@ def _solve(
     lags: Array,
     degree: int,
     slope: Array,
-) -> _Solution:
+) -> ThermalFit:
     """Fit the stress on each pad as a polynomial in the temperature of the elastomer.
 
     Args:
@@ -352,42 +332,23 @@ def _solve(
     scatter = np.sqrt((weighted_residual**2).mean(axis=0)).clip(1)
     n_correlated = max(1.0, lags[-1] / BLOCK_S)
     variance = n_correlated * np.diag(np.linalg.inv(normal))[1 : degree + 1]
-    misfit = np.log(root_mean_square(weighted_residual)) - np.log(weight).mean()
-    return _Solution(
-        lags,
-        behind,
-        values,
-        residual,
-        np.outer(scatter, np.sqrt(variance)),
-        float(misfit),
-    )
+    deviation = np.outer(scatter, np.sqrt(variance))
 
-
-def _describe(data: Warming, best: _Solution) -> ThermalFit:
-    """Return the result of the fit.
-
-    Args:
-        data: Temperatures and pad stresses, averaged over blocks of 1 s.
-        best: Solution with the most likely time constants of the low-pass filters.
-    """
-    lags, behind, values, residual, deviation, _ = best
     covariance = residual.T @ residual / max(float(behind @ behind), 1e-12)
     variances, directions = np.linalg.eigh(covariance)
     patterns = directions * np.sqrt(np.maximum(variances, 0))
     # `eigh` returns eigenvalues in rising order, so the largest errors come last.
     ramp = patterns[:, ::-1][:, :MAX_LAG_PATTERNS]
-    n_degrees = deviation.shape[1]
-    sign = np.where(ramp[:, :1] < 0, -1.0, 1.0)
     model = ThermalModel(
         reference=np.array(round(float(data.temperature[0]), 3)),
         lag=lags,
-        coefficient=values[1 : n_degrees + 1].T,
-        deviation=deviation * sign,
+        coefficient=values[1 : degree + 1].T,
+        deviation=deviation * np.where(ramp[:, :1] < 0, -1.0, 1.0),
         ramp=ramp,
-        lagging=values[n_degrees + 1 :].T,
+        lagging=values[degree + 1 :].T,
     )
-    level = data.temperature - data.temperature[0] - behind
-    return ThermalFit(data, model, values[0], level, residual)
+    misfit = np.log(root_mean_square(weighted_residual)) - np.log(weight).mean()
+    return ThermalFit(data, model, values[0], u, residual, float(misfit))
 
 
 def _check(

@@ -46,7 +46,6 @@ def encode_compensation(
             `Compensation.collect_states` returns it.
     """
     time_ns, state = motion or UNKNOWN_MOTION
-    time_ns, state = motion or UNKNOWN_MOTION
     begin = encode_header(stamp_ns, frame_id) + bytes([motion is not None])
     effects = [states.get(name, NO_STATE) for name in STATES]
     columns = time_ns - stamp_ns, state[:, 0].ravel(), state[:, 1:].ravel(), *effects

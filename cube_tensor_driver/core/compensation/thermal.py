@@ -110,7 +110,7 @@ class Thermal:
         # first row or in a gap are unknown.
         self._unknown = np.full(n_cubes, START_KELVIN)
         self.offset = np.zeros(stiffness.shape)
-        self.is_known = np.zeros(n_cubes, bool)
+        self._update()
 
     def advance(self, scan: Columns) -> None:
         """Advance the temperatures of the elastomer to the time stamps of a scan's rows.
@@ -160,27 +160,28 @@ class Thermal:
             C) that the interval replaced.
         """
         # An unknown temperature does not change, so any number may stand for it.
-        first, last = inputs = np.array([before, now])[..., None]
-        inputs[np.isnan(inputs)] = 0
+        first, last = np.nan_to_num([before, now])[..., None]
         return self._filters.advance(elapsed_s, first, last, self._endless)
 
     def _update(self) -> None:
         """Compute `offset` and `is_known` from the state."""
-        is_measured = ~np.isnan(self._measured)
+        self._is_measured = ~np.isnan(self._measured)
         temperature = self._filters.output[:, 0]
-        level = np.where(is_measured, temperature - self._reference, 0)
+        # Temperature of the elastomer above the reference, and how far it lags behind (C, 1), in K.
+        self._level = np.where(self._is_measured, temperature - self._reference, 0)[:, None]
+        self._behind = np.nan_to_num(self._measured - temperature)[:, None]
         self.offset[:] = 0
         for coefficient in self._relative:
             self.offset += coefficient
-            self.offset *= level[:, None]
+            self.offset *= self._level
         for coefficient, behind_filter in zip(
             self._relative_lagging, self._filters.lag, strict=False
         ):
             self.offset += coefficient * behind_filter
-        behind = np.abs(self._measured - temperature)
-        deviation = self._ramp_size * behind + self._linear_size * self._unknown
-        # The comparison is false for NaN, which means that no temperature has been measured so far.
-        self.is_known = self.has_model & (deviation <= MAX_DEVIATION)
+        by_lag = self._ramp_size * np.abs(self._behind[:, 0])
+        deviation = by_lag + self._linear_size * self._unknown
+        is_certain = self._is_measured & (deviation <= MAX_DEVIATION)
+        self.is_known = self.has_model & is_certain
 
     def errors(self, cubes: Index) -> Array:
         """Return the errors (n, P, k) of the thermal stress on the pads of n cubes, in Pa.
@@ -190,26 +191,14 @@ class Thermal:
         coefficients of the calibration. If no temperature has been measured yet, the reference
         temperature is assumed, with a standard deviation of 5 K.
         """
-        temperature = self._filters.output[cubes]
-        behind = self._measured[cubes, None] - temperature
-        is_measured = ~np.isnan(behind)
-        unknown = np.where(
-            is_measured,
-            self._unknown[cubes, None],
-            LOST_KELVIN,
-        )
-        level = np.where(
-            is_measured,
-            temperature - self._reference[cubes, None],
-            0,
-        )
+        unknown = np.where(self._is_measured, self._unknown, LOST_KELVIN)
         powers = 1 + np.arange(self._deviation.shape[2])
         by_cause = (
-            (self._coefficient[..., :1], unknown),
-            (self._ramp, np.nan_to_num(behind)),
-            (self._deviation, level**powers),
+            (self._coefficient[..., :1], unknown[:, None]),
+            (self._ramp, self._behind),
+            (self._deviation, self._level**powers),
         )
-        return np.concatenate([size[cubes] * by[:, None] for size, by in by_cause], axis=2)
+        return np.concatenate([size[cubes] * by[cubes, None] for size, by in by_cause], axis=2)
 
     def collect_parts(self) -> list[Array]:
         """Return the arrays that hold all that later rows need of the earlier ones (the state).
