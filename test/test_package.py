@@ -130,6 +130,13 @@ def test_each_class_has_a_name_of_its_own():
     assert not {name: paths for name, paths in modules.items() if len(paths) > 1}
 
 
+def test_only_the_border_to_ros_has_values_of_any_type():
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            is_any = isinstance(node, ast.alias) and node.name == "Any"
+            assert not is_any or "ros" in path.parts, path
+
+
 def test_heavy_libraries_stay_at_home():
     for room, module, path in all_imports():
         homes = HOMES.get(module.split(".")[0], {room})
