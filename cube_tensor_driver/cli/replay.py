@@ -111,14 +111,11 @@ def read_single_keys() -> Iterator[bool]:
     The terminal is restored at the end of the `with` block.
 
     Yields:
-        Whether keys can be read; they cannot if stdin is not a terminal, or on Windows.
+        Whether keys can be read; they cannot if stdin is not a terminal.
     """
-    try:
-        import termios
-        import tty
-    except ImportError:
-        yield False
-        return
+    import termios
+    import tty
+
     if not sys.stdin.isatty():
         yield False
         return
