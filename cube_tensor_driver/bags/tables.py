@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +24,10 @@ ROWS_PER_GROUP = 1 << 16
 """Number of rows (samples of cubes) that are written together, as one row group (independent block)
 of a Parquet file or one chunk (file) of each Zarr array. Fewer, larger groups compress better and
 are read faster."""
+
+PARTIAL_PREFIX = ".partial-"
+"""Prefix of the name of the folder, beside a result, in which the result is written until it is
+complete. After an interruption, an incomplete result is computed again from the start."""
 
 _CUBE_NAME = pyarrow.dictionary(pyarrow.int32(), pyarrow.string())
 """Type of the column with the cubes' names. Dictionary encoding stores each name once, and only a
@@ -130,6 +135,33 @@ def report_write_errors(path: Path) -> Iterator[None]:
             f"{path}: {error.strerror or error}; name a folder that can be written, on a disk "
             "with room"
         ) from None
+
+
+@contextmanager
+def complete_output(output: Path) -> Iterator[Path]:
+    """Give a file or folder its final name when the `with` block has completed it.
+
+    Args:
+        output: File or folder that the block makes.
+
+    Yields:
+        Path to which the block writes it.
+
+    Raises:
+        BagError: Writing to the disk failed.
+    """
+    # Renaming requires that both names are in the same file system. Each output has a folder of its
+    # own, because other processes create and remove theirs meanwhile.
+    final = output.absolute()
+    folder = final.with_name(f"{PARTIAL_PREFIX}{final.name}")
+    with report_write_errors(output):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        try:
+            yield folder / final.name
+            (folder / final.name).replace(final)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 class BufferedTable:

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 
 from ...config.yaml import read_yaml, write_yaml
 from ...core.errors import BagError, CubeError
-from ..tables import report_write_errors
-from .job import PARTIAL_PREFIX, Overrides, ReprocessJob, ReprocessResult, reprocess
+from ..tables import PARTIAL_PREFIX, report_write_errors
+from .job import Overrides, ReprocessJob, ReprocessResult, reprocess
 
 if TYPE_CHECKING:
     from .contacts import ContactOptions

@@ -8,7 +8,6 @@ calibrations or another tare (measurement without load) are chosen.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,16 +30,12 @@ from ..metadata import quality
 from ..read import Bag, serialise, stamp_ns
 from ..recording import Settings, reconstruct_rows
 from ..source import BagSource, Segment
-from ..tables import BufferedTable, TableWriter, report_write_errors
+from ..tables import BufferedTable, TableWriter, complete_output
 from ..write import BagWriter
 
 if TYPE_CHECKING:
     from ...msg import SkinInfo
     from .contacts import ContactOptions
-
-PARTIAL_PREFIX = ".partial-"
-"""Prefix of the name of the folder, beside the results, in which a job writes its result until the
-result is complete. After an interruption, an incomplete result is computed again from the start."""
 
 MAX_NAMED_CUBES = 5
 """Largest number of cubes that one error message names."""
@@ -113,18 +108,8 @@ def reprocess(job: ReprocessJob) -> ReprocessResult:
         BagError: The bag is damaged, the overrides do not fit its cubes, or the output cannot be
             written.
     """
-    # Renaming the complete output requires that both names are in the same file system. Each job
-    # has a folder of its own, because jobs in other processes create and remove theirs meanwhile.
-    folder = job.output.parent / f"{PARTIAL_PREFIX}{job.output.name}"
-    partial = folder / job.output.name
-    with report_write_errors(job.output):
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        with Bag(job.bag) as bag:
-            result = _reprocess(bag, job, partial)
-        partial.replace(job.output)
-        folder.rmdir()
-    return result
+    with complete_output(job.output) as partial, Bag(job.bag) as bag:
+        return _reprocess(bag, job, partial)
 
 
 def make_table(path: Path, cubes: list[str]) -> BufferedTable:
