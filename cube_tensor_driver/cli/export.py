@@ -14,13 +14,6 @@ from .parser import Parser, count
 if TYPE_CHECKING:
     from ..lerobot.export import Exported
 
-UNUSUAL_DEPTH = 2
-"""Ratio of the largest to the usual number of samples in a frame above which a warning is printed.
-
-A frame is one time step of a LeRobot data set. All frames are stored with the size of the largest
-one, so a single frame with unusually many samples enlarges the whole data set.
-"""
-
 TABLES = {
     "parquet": "one Parquet table per bag",
     "csv": "one CSV table per bag",
@@ -82,8 +75,6 @@ def run(options: argparse.Namespace) -> int:
     Raises:
         CubeError: A bag, an option or the output folder cannot be used.
     """
-    from dataclasses import fields
-
     from ..bags.reprocess.all_bags import RECIPE_NAME
     from ..lerobot.export import check_empty, export_lerobot
     from ..lerobot.plan import Choices
@@ -99,8 +90,7 @@ def run(options: argparse.Namespace) -> int:
     # All bags become one data set with the same choices. Each field of `Choices` has the value of
     # the option with the same name.
     options.overrides = reprocess.read_overrides(options)
-    names = [field.name for field in fields(Choices)]
-    choices = Choices(**{name: getattr(options, name) for name in names})
+    choices = Choices(*(getattr(options, name) for name in Choices._fields))
     with show_progress_bar() as report:
         exported = export_lerobot(
             options.bags,
@@ -126,12 +116,5 @@ def show_exported(folder: Path, exported: Exported) -> None:
         f"{folder}: {exported.episodes} episodes, {exported.frames} frames, {exported.rows} "
         f"samples, {exported.depth} in a window; {others}"
     )
-    if exported.depth > UNUSUAL_DEPTH * exported.usual:
-        say(
-            f"usual are {exported.usual:g} samples in a window, but one frame holds "
-            f"{exported.depth}: hubs paused, or stamps are in doubt; --marks can leave that out",
-            "yellow",
-        )
-    for what, number in exported.left_out.items():
-        if number:
-            say(f"left out: {number} {what}", "yellow")
+    if exported.left_out:
+        say(f"left out: {exported.left_out} samples outside of the marks", "yellow")

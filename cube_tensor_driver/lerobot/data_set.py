@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +21,8 @@ from ..config.skin import Skin
 from ..core.arrays import AnyArray
 from ..core.modes import COMPONENTS, STRESS
 from .images import decode
-from .plan import Episode
+from .plan import BagPlan, Episode
 from .statistics import MAX_SAMPLE_ROWS, Part, describe, summarise
-from .topics import Topic
 from .windows import TACTILE
 
 VERSION = "v3.0"
@@ -66,153 +65,133 @@ files."""
 class DataSet:
     """A LeRobot data set (table of frames, which are time steps at a constant rate).
 
-    It is written episode after episode (an episode is one execution of a task).
-
-    Attributes:
-        calibrations: One entry for the first calibrations, and one for each change. An entry has
-            the ids of the cubes' calibrations, and the bag and the stamp (ns since the Unix epoch)
-            from which on they were used.
+    It is written bag after bag.
     """
 
     def __init__(
         self,
         folder: Path,
-        skin: Skin,
-        topics: list[Topic],
         fps: int,
-        frames: int,
+        names: Mapping[str, Sequence[str]],
+        total_frames: int,
     ) -> None:
         """Begin an empty data set.
 
         Args:
             folder: Folder of the data set.
-            skin: Skin of all bags.
-            topics: Topics other than stress that become features (columns), such as images.
             fps: Frames per second.
-            frames: Total number of frames that will be written.
+            names: Names of the numbers in features (columns) of one dimension.
+            total_frames: Number of frames that will be written.
         """
-        self.calibrations: list[dict[str, object]] = []
         self._folder = folder
-        self._skin = skin
         self._fps = fps
-        self._total_frames = frames
-        self._names = {topic.key: list(topic.names) for topic in topics}
-        self._names[f"{TACTILE}.count"] = list(skin.names)
+        self._names = names
+        self._total_frames = total_frames
         self._features: dict[str, dict[str, object]] = {}
         self._tasks: dict[str, int] = {}
         self._episodes: list[dict[str, object]] = []
-        self._writer: pyarrow.parquet.ParquetWriter | None = None
-        self._file_number = 0
-        self._frames = self._first_frame = 0
+        self._files = self._frames = 0
         self._random = np.random.default_rng(0)
-        # Each call of `write` appends one part (statistics of its frames) to every feature's list.
-        # The parts from index `_first_part` on belong to the current episode.
+        # The statistics of each block of frames that has been written, for each feature.
         self._parts: dict[str, list[Part]] = defaultdict(list)
-        self._first_part = 0
 
-    def write(self, columns: Columns, task: str) -> None:
-        """Write successive frames of an episode as one group of rows of the current Parquet file.
-
-        Args:
-            columns: Values of the features by their names, without time and indices (of frame,
-                episode and task), which are added here.
-            task: Text of the episode's task.
-        """
-        index = self._frames + np.arange(len(columns[TACTILE]))
-        frame = index - self._first_frame
-        task_index = self._tasks.setdefault(task, len(self._tasks))
-        counters: dict[str, AnyArray] = {
-            "timestamp": (frame / self._fps).astype(np.float32),
-            "frame_index": frame,
-            "episode_index": np.full_like(frame, len(self._episodes)),
-            "index": index,
-            "task_index": np.full_like(frame, task_index),
-        }
-        counted = {key: values[:, np.newaxis] for key, values in counters.items()}
-        columns = {**columns, **counted}
-        table = pyarrow.table({key: _as_column(one) for key, one in columns.items()})
-        if self._writer is None:
-            name = FILE_NAME.format(chunk_index=0, file_index=self._file_number)
-            path = self._folder / "data" / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            # Dictionary encoding saves space only if values repeat. Measured ones rarely do.
-            self._writer = pyarrow.parquet.ParquetWriter(
-                path,
-                table.schema,
-                compression="zstd",
-                use_dictionary=False,
-            )
-        self._writer.write_table(table)
-        self._frames += len(table)
-
-        for key, values in columns.items():
-            if isinstance(values, list):
-                # A few pixels of one image suffice for the statistics of colours. Decoding every
-                # image would be slow.
-                pixels: AnyArray = decode(values[0])
-                shape = pixels.shape
-                names: Sequence[str] | None = IMAGE_AXES
-                few = pixels[::PIXEL_STRIDE, ::PIXEL_STRIDE]
-                # LeRobot normalises images of the shape (bands, height, width), to which statistics
-                # of the shape (bands, 1, 1) are broadcast.
-                rows: AnyArray = few.reshape(-1, shape[2], 1, 1)
-            else:
-                shape = values.shape[1:]
-                names = AXES[: len(shape)] if len(shape) > 1 else self._names.get(key)
-                rows = values.reshape(-1, 1 if key == RESIDUAL else shape[-1])
-            dtype = "image" if isinstance(values, list) else values.dtype.name
-            self._features[key] = {
-                "dtype": dtype,
-                "shape": shape,
-                "names": names,
-            }
-            # Integers beside the stress (stamps, status bits) have no statistics, because policies
-            # do not normalise them.
-            if key in (TACTILE, RESIDUAL) or not key.startswith(TACTILE):
-                expected_rows = len(rows) * self._total_frames / len(table)
-                is_chosen = self._random.random(len(rows)) < MAX_SAMPLE_ROWS / expected_rows
-                self._parts[key].append(describe(rows, is_chosen))
-
-    def close_file(self) -> None:
-        """Complete the current Parquet file; frames that follow get a new file."""
-        if self._writer is not None:
-            self._writer.close()
-            self._writer = None
-            self._file_number += 1
-
-    def end_episode(self, episode: Episode, bag: str) -> None:
-        """Add an episode, whose frames have all been written, to the table of episodes.
+    def write_bag(self, plan: BagPlan, blocks: Iterator[Columns]) -> None:
+        """Write the episodes (executions of a task) of a bag as one Parquet file.
 
         Args:
-            episode: The episode.
-            bag: Name of its bag.
+            plan: Episodes and frames of the bag.
+            blocks: Values of the features in each block of frames, without time and indices (of
+                frame, episode and task), which are added here.
         """
-        frames = len(episode.frames)
+        path = self._folder / "data" / FILE_NAME.format(chunk_index=0, file_index=self._files)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        writer = None
+        for episode in plan.episodes:
+            first_frame, first_part = self._frames, len(self._parts[TACTILE])
+            task_index = self._tasks.setdefault(episode.task, len(self._tasks))
+            for _ in episode.blocks:
+                columns = dict(next(blocks))
+                index = self._frames + np.arange(len(columns[TACTILE]))
+                frame = index - first_frame
+                columns |= {
+                    "timestamp": (frame / self._fps).astype(np.float32),
+                    "frame_index": frame,
+                    "episode_index": np.full_like(frame, len(self._episodes)),
+                    "index": index,
+                    "task_index": np.full_like(frame, task_index),
+                }
+                table = pyarrow.table({key: _as_column(one) for key, one in columns.items()})
+                # Dictionary encoding saves space only if values repeat. Measured ones rarely do.
+                writer = writer or pyarrow.parquet.ParquetWriter(
+                    path, table.schema, compression="zstd", use_dictionary=False
+                )
+                writer.write_table(table)
+                self._frames += len(table)
+                for key, values in columns.items():
+                    self._describe(key, values)
+            self._end_episode(plan, episode, first_frame, first_part)
+        if writer is not None:
+            writer.close()
+            self._files += 1
+
+    def _describe(self, key: str, values: AnyArray | list[bytes]) -> None:
+        """Note type, shape and statistics of a block of values of a feature."""
+        names: Sequence[str] | None
+        rows: AnyArray
+        if isinstance(values, list):
+            # A few pixels of one image suffice for the statistics of colours. Decoding every image
+            # would be slow.
+            pixels = decode(values[0])
+            dtype, shape, names = "image", pixels.shape, IMAGE_AXES
+            # LeRobot normalises images of the shape (bands, height, width), to which statistics of
+            # the shape (bands, 1, 1) are broadcast.
+            rows = pixels[::PIXEL_STRIDE, ::PIXEL_STRIDE].reshape(-1, shape[2], 1, 1)
+        else:
+            dtype, shape = values.dtype.name, values.shape[1:] or (1,)
+            names = AXES[: len(shape)] if len(shape) > 1 else self._names.get(key)
+            rows = values.reshape(-1, 1 if key == RESIDUAL else shape[-1])
+        self._features[key] = {"dtype": dtype, "shape": shape, "names": names}
+        # Integers beside the stress (stamps, status bits) have no statistics, because policies do
+        # not normalise them.
+        if key in (TACTILE, RESIDUAL) or not key.startswith(TACTILE):
+            expected_rows = len(rows) * self._total_frames / len(values)
+            is_chosen = self._random.random(len(rows)) < MAX_SAMPLE_ROWS / expected_rows
+            self._parts[key].append(describe(rows, is_chosen))
+
+    def _end_episode(
+        self, plan: BagPlan, episode: Episode, first_frame: int, first_part: int
+    ) -> None:
+        """Add an episode, whose frames have all been written, to the table of episodes."""
+        frames = self._frames - first_frame
         described: dict[str, object] = {
             "episode_index": len(self._episodes),
             "tasks": [episode.task],
             "length": frames,
             "data/chunk_index": 0,
-            "data/file_index": self._file_number,
-            "dataset_from_index": self._first_frame,
+            "data/file_index": self._files,
+            "dataset_from_index": first_frame,
             "dataset_to_index": self._frames,
             # The descriptions of all episodes are in one file, because each takes only some kB.
             "meta/episodes/chunk_index": 0,
             "meta/episodes/file_index": 0,
-            "bag": bag,
+            "bag": plan.path.name,
             "begin_ns": episode.begin_ns,
         }
         for key, parts in self._parts.items():
-            statistics = summarise(parts[self._first_part :], frames)
+            statistics = summarise(parts[first_part:], frames)
             described |= {f"stats/{key}/{name}": value for name, value in statistics.items()}
         self._episodes.append(described)
-        self._first_frame = self._frames
-        self._first_part = len(self._parts[TACTILE])
 
-    def write_meta(self) -> None:
+    def write_meta(self, skin: Skin, calibrations: list[dict[str, object]]) -> None:
         """Write episodes, tasks, features and statistics into the folder meta/ of the data set.
 
-        It is called once, after the last episode.
+        It is called once, after the last bag.
+
+        Args:
+            skin: Skin of all bags.
+            calibrations: One entry for the first calibrations, and one for each change. An entry
+                has the ids of the cubes' calibrations, and the bag and the stamp (ns since the Unix
+                epoch) from which on they were used.
         """
         meta = self._folder / "meta"
         path = meta / "episodes" / FILE_NAME.format(chunk_index=0, file_index=0)
@@ -220,11 +199,11 @@ class DataSet:
         pyarrow.parquet.write_table(pyarrow.Table.from_pylist(self._episodes), path)
         _write_tasks(list(self._tasks), meta / "tasks.parquet")
         # LeRobot's tools keep the key "info" of a feature when they copy or merge data sets.
-        about = _describe_skin(self._skin)
-        self._features[TACTILE]["info"] = about | {"calibrations": self.calibrations}
+        about = _describe_skin(skin)
+        self._features[TACTILE]["info"] = about | {"calibrations": calibrations}
         info = {
             "codebase_version": VERSION,
-            "robot_type": self._skin.name,
+            "robot_type": skin.name,
             "total_episodes": len(self._episodes),
             "total_frames": self._frames,
             "total_tasks": len(self._tasks),
@@ -239,11 +218,7 @@ class DataSet:
         }
         statistics = {key: summarise(parts, self._frames) for key, parts in self._parts.items()}
         for name, value in (("info", info), ("stats", statistics)):
-            text = json.dumps(
-                value,
-                indent=4,
-                ensure_ascii=False,
-            )
+            text = json.dumps(value, indent=4, ensure_ascii=False)
             (meta / f"{name}.json").write_text(text + "\n", encoding="utf-8")
 
 

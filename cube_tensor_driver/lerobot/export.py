@@ -4,31 +4,28 @@
 
 from __future__ import annotations
 
-import shutil
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
+from ..bags.read import Bag
 from ..bags.reprocess.job import choose_settings, reconstruct
 from ..bags.source import BagSource, open_bag
-from ..bags.tables import report_write_errors
-from ..config.skin import Skin
-from ..core.arrays import Index
+from ..bags.tables import complete_output
+from ..core.arrays import AnyArray, Index
 from ..core.errors import BagError
 from ..core.rows import StressRows
-from .data_set import DataSet
+from .data_set import Columns, DataSet
 from .plan import BagPlan, Choices, plan_bag
 from .topics import Topic, find_topics
-from .windows import stream_windows
+from .windows import TACTILE, stream_windows
 
 Report = Callable[[float, float, str], None]
 """Function that displays progress. Its arguments are the amount done, the total amount in the same
 unit, and a text that names the current step."""
 
 
-@dataclass(frozen=True)
-class Exported:
+class Exported(NamedTuple):
     """Size of an exported data set, and of what was left out of it.
 
     Attributes:
@@ -36,18 +33,16 @@ class Exported:
         frames: Number of exported frames (time steps).
         rows: Number of exported samples of cubes.
         depth: Number of samples of each cube that a frame has room for.
-        usual: Median number of samples of a cube in the frames of a bag; the largest of all bags.
         features: Names of the features (columns) that come from topics other than stress.
-        left_out: Numbers of samples and episodes that were not exported, by a text with the reason.
+        left_out: Number of samples outside of the marks, which are not exported.
     """
 
     episodes: int
     frames: int
     rows: int
     depth: int
-    usual: float
     features: list[str]
-    left_out: Counter[str]
+    left_out: int
 
 
 def export_lerobot(
@@ -76,50 +71,37 @@ def export_lerobot(
     for number, path in enumerate(bags):
         report(number, len(bags), f"counting {path}")
         plans.append(plan_bag(path, choices))
-    skin = _check_same_skin(plans)
+    cubes = [[(cube.name, cube.xyz, cube.rpy) for cube in plan.skin.cubes] for plan in plans]
+    for path, found in zip(bags, cubes, strict=True):
+        if found != cubes[0]:
+            raise BagError(
+                f"{path}: its cubes, or their poses, are not those of {bags[0]}: export them into "
+                "two folders"
+            )
     depth = max(int(plan.counts.max()) for plan in plans)
     if not depth:
         raise BagError(f"{bags[0]}: no sample lies between the marks; nothing to export")
     topics = find_topics(bags, choices)
-    episodes = [episode for plan in plans for episode in plan.episodes]
-    frames = sum(len(episode.frames) for episode in episodes)
-    # The incomplete data set lies beside the final folder, so that it can be renamed. That works
-    # only within one file system.
-    partial = folder.absolute()
-    partial = partial.with_name(f"{partial.name}.partial")
-    try:
-        # An export that was killed may have left an incomplete data set here. It cannot be
-        # continued, so it is removed.
-        shutil.rmtree(partial, ignore_errors=True)
-        with report_write_errors(folder):
-            data_set = DataSet(
-                partial,
-                skin,
-                topics,
-                choices.fps,
-                frames,
-            )
-            for plan in plans:
-                _write_bag(
-                    data_set,
-                    plan,
-                    topics,
-                    depth,
-                    choices,
-                    report,
-                )
-            data_set.write_meta()
-            partial.replace(folder)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    names = {key: list(topic.names) for key, topic in topics.items()}
+    skin = plans[0].skin
+    names[f"{TACTILE}.count"] = list(skin.names)
+    frames = sum(len(block) for plan in plans for block in plan.blocks)
+    calibrations: list[dict[str, object]] = []
+    with complete_output(folder) as partial:
+        data_set = DataSet(partial, choices.fps, names, frames)
+        for plan in plans:
+            with open_bag(plan.path, choices.frequencies) as source:
+                rows = _read_stress(plan, source, choices, calibrations)
+                windows = stream_windows(rows, plan.blocks, plan.counts, depth)
+                data_set.write_bag(plan, _add_topics(plan, windows, source.bag, topics, report))
+        data_set.write_meta(skin, calibrations)
     return Exported(
-        episodes=len(episodes),
+        episodes=sum(len(plan.episodes) for plan in plans),
         frames=frames,
         rows=sum(int(plan.counts.sum()) for plan in plans),
         depth=depth,
-        usual=max(plan.usual for plan in plans),
-        features=[topic.key for topic in topics],
-        left_out=sum((plan.left_out for plan in plans), Counter()),
+        features=list(topics),
+        left_out=sum(plan.left_out for plan in plans),
     )
 
 
@@ -133,97 +115,52 @@ def check_empty(folder: Path) -> None:
         raise BagError(f"{folder} is not empty; name another folder, or remove what is in it")
 
 
-def _check_same_skin(plans: list[BagPlan]) -> Skin:
-    """Check that all bags have the same cubes at the same poses, and return their skin.
-
-    Args:
-        plans: The bags, at least one.
-
-    Raises:
-        BagError: The cubes of two bags differ in their names or poses.
-    """
-    first, *others = plans
-    expected = [(cube.name, cube.xyz, cube.rpy) for cube in first.skin.cubes]
-    for plan in others:
-        found = [(cube.name, cube.xyz, cube.rpy) for cube in plan.skin.cubes]
-        if found != expected:
-            new = [cube for cube in found if cube not in expected]
-            raise BagError(
-                f"{plan.path}: its {len(found)} cubes are not those of {first.path}, which has "
-                f"{len(expected)}; different are {new[:1] or 'missing cubes'}: export them into "
-                "two folders"
-            )
-    return first.skin
-
-
-def _write_bag(
-    data_set: DataSet,
+def _add_topics(
     plan: BagPlan,
-    topics: list[Topic],
-    depth: int,
-    choices: Choices,
+    windows: Iterator[dict[str, AnyArray]],
+    bag: Bag,
+    topics: dict[str, Topic],
     report: Report,
-) -> None:
-    """Reconstruct the stress of a bag and write its episodes into a data set.
+) -> Iterator[Columns]:
+    """Yield the values of all features (columns) in each block of frames.
 
     Args:
-        data_set: The data set to write into.
         plan: Episodes and frames of the bag.
-        topics: Topics other than stress that become features (columns) of the data set.
-        depth: Number of samples of each cube that a frame has room for.
-        choices: Options that the user chose, such as the frame rate.
+        windows: Features of the stress in each block.
+        bag: The open bag.
+        topics: Topics other than stress by the names of their features.
         report: Function that displays progress.
     """
-    with open_bag(plan.path, choices.frequencies) as source:
-        streams = {topic.key: topic.open(source.bag) for topic in topics}
-        blocks = [
-            block for episode in plan.episodes for block in episode.divide_into_blocks(choices.fps)
-        ]
-        rows = _find_stress(data_set, plan, source, choices)
-        windows = stream_windows(rows, blocks, plan.counts, depth)
-        for episode in plan.episodes:
-            for block in episode.divide_into_blocks(choices.fps):
-                ends_ns = plan.edges_ns[block.start : block.stop]
-                columns = {key: stream.at(ends_ns) for key, stream in streams.items()}
-                data_set.write({**next(windows), **columns}, episode.task)
-                report(
-                    block.stop,
-                    len(plan.counts),
-                    f"exporting {plan.path}",
-                )
-            data_set.end_episode(episode, plan.path.name)
-    data_set.close_file()
+    ends_ns = [plan.edges_ns[block.start : block.stop] for block in plan.blocks]
+    others = {key: topic.sample(bag, ends_ns) for key, topic in topics.items()}
+    for block, window in zip(plan.blocks, windows, strict=True):
+        yield {**window, **{key: next(values) for key, values in others.items()}}
+        report(block.stop, len(plan.counts), f"exporting {plan.path}")
 
 
-def _find_stress(
-    data_set: DataSet,
+def _read_stress(
     plan: BagPlan,
     source: BagSource,
     choices: Choices,
+    calibrations: list[dict[str, object]],
 ) -> Iterator[tuple[Index, StressRows]]:
     """Yield the number of the frame of each row, and the rows with the reconstructed stress.
 
     Args:
-        data_set: The data set, in which the calibrations are noted.
         plan: Episodes and frames of the bag.
         source: The recorded frequencies.
         choices: Calibrations and tare that replace the recorded ones.
+        calibrations: List to which each change of calibrations is added.
     """
-    noted = data_set.calibrations
     settings = choose_settings(source, choices.overrides)
     for segment, rows in reconstruct(source, settings):
-        known = rows.select(rows.cube < len(plan.skin.cubes))
-        if not len(known):
+        rows = rows.select(rows.cube < len(plan.skin.cubes))
+        if not len(rows):
             continue
         ids = [one.id for one in settings[segment.number].calibrations]
-        # An entry is added only when the calibrations change, which is rare.
-        if not noted or noted[-1]["ids"] != ids:
-            since_ns = int(known.stamp_ns.min())
-            noted.append(
-                {
-                    "bag": plan.path.name,
-                    "since_ns": since_ns,
-                    "ids": ids,
-                }
-            )
-        yield plan.find_frames(known.stamp_ns), known
+        if not calibrations or calibrations[-1]["ids"] != ids:
+            since_ns = int(rows.stamp_ns.min())
+            calibrations.append({"bag": plan.path.name, "since_ns": since_ns, "ids": ids})
+        frame = plan.find_frames(rows.stamp_ns)
+        is_used = plan.counts[frame, rows.cube].astype(bool)
+        yield frame[is_used], rows.select(is_used)

@@ -5,13 +5,11 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
 
-from ..bags.read import Bag, stamp_ns
 from ..core.arrays import Single
 from ..core.errors import BagError
 
@@ -42,62 +40,6 @@ LEAVE_OUT = "leave the topic out by naming the others with --topics"
 
 Shape = tuple[int, int, int]
 """Height and width of an image in pixels, and its number of bands (colour channels)."""
-
-
-class ImageStream:
-    """The images on one topic of a bag, read in the order of recording.
-
-    If the bag does not have the topic, every frame (time step of the data set) gets a black image.
-    """
-
-    def __init__(self, bag: Bag, topic: str, shape: Shape) -> None:
-        """Read the first image.
-
-        Args:
-            bag: Open bag.
-            topic: Topic of the images.
-            shape: Height, width and number of bands that every image must have.
-        """
-        self._where = f"{bag.path}: {topic}"
-        self._shape = shape
-        self._unread = bag.read_decoded({topic})
-        self._next: RawImage | CompressedImage | None = self._read()
-        height, width, bands = shape
-        black = Image.new(BAND_MODES[bands - 1], (width, height))
-        self._latest = _as_png(black)
-
-    def at(self, ends_ns: Iterable[int]) -> list[bytes]:
-        """Return the file of the newest image that is stamped before the end of each frame.
-
-        For frames that end before the first image, it is the file of a black image.
-
-        Args:
-            ends_ns: Ends of frames, in ns since the Unix epoch; no call may go back in time.
-
-        Raises:
-            BagError: An image cannot be read, or has another shape than the first one.
-        """
-        files = []
-        for end_ns in ends_ns:
-            message = None
-            while self._next is not None and stamp_ns(self._next) < end_ns:
-                message = self._next
-                self._next = self._read()
-            # Only the last image before the end of the frame is encoded, because encoding is slow.
-            if message is not None:
-                self._latest, shape = encode(message, self._where)
-                if shape != self._shape:
-                    raise BagError(
-                        f"{self._where}: an image of {shape} after ones of {self._shape}; "
-                        f"{LEAVE_OUT}"
-                    )
-            files.append(self._latest)
-        return files
-
-    def _read(self) -> object:
-        """Return the next message; None at the end of the bag."""
-        _, message = next(self._unread, (0, None))
-        return message
 
 
 def encode(message: RawImage | CompressedImage, where: str) -> tuple[bytes, Shape]:
@@ -131,6 +73,12 @@ def decode(file: bytes) -> Single:
     return np.atleast_3d(pixels / np.float32(255))
 
 
+def make_black_image(shape: Shape) -> bytes:
+    """Return the content of a PNG file with a black image."""
+    height, width, bands = shape
+    return _as_png(Image.new(BAND_MODES[bands - 1], (width, height)))
+
+
 def _encode_raw(message: RawImage) -> bytes:
     """Encode uncompressed pixels as PNG.
 
@@ -141,24 +89,12 @@ def _encode_raw(message: RawImage) -> bytes:
     if message.encoding not in PILLOW_MODES:
         raise ValueError(f"encoding {message.encoding}; known: {', '.join(PILLOW_MODES)}")
     mode, order = PILLOW_MODES[message.encoding]
-    size = int(message.width), int(message.height)
+    size = message.width, message.height
     if not all(size):
         raise ValueError(f"an image of {size[0]} x {size[1]} pixels")
     # `message.step` is the length of a line of the image in bytes, which may be more than its
     # pixels need. Pillow raises a ValueError if the message has too few bytes.
-    pixels = np.asarray(message.data).tobytes()
-    step = int(message.step)
-    return _as_png(
-        Image.frombuffer(
-            mode,
-            size,
-            pixels,
-            "raw",
-            order,
-            step,
-            1,
-        )
-    )
+    return _as_png(Image.frombuffer(mode, size, message.data, "raw", order, message.step, 1))
 
 
 def _as_png(image: Image.Image) -> bytes:

@@ -13,9 +13,7 @@ number of samples, which must be known before the first frame is written.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -59,8 +57,7 @@ stamps, although nothing is wrong.
 """
 
 
-@dataclass(frozen=True)
-class Choices:
+class Choices(NamedTuple):
     """Options that the user chooses for a data set.
 
     Attributes:
@@ -92,27 +89,16 @@ class Episode(NamedTuple):
     Attributes:
         task: Text of the task, such as "pick up the cup".
         begin_ns: Time at which its first frame begins, in ns since the Unix epoch.
-        frames: Numbers of its frames among the intervals of the bag (`BagPlan.find_frames`).
+        blocks: Numbers of its frames among the intervals of the bag (`BagPlan.find_frames`), in
+            blocks that are written together and last 1 s each (the last one at most 1 s).
     """
 
     task: str
     begin_ns: int
-    frames: range
-
-    def divide_into_blocks(self, length: int) -> list[range]:
-        """Divide the frames into blocks of `length` frames; the last block may be shorter."""
-        return [
-            self.frames[k : k + length]
-            for k in range(
-                0,
-                len(self.frames),
-                length,
-            )
-        ]
+    blocks: list[range]
 
 
-@dataclass(frozen=True, eq=False)
-class BagPlan:
+class BagPlan(NamedTuple):
     """Episodes and frames of a bag.
 
     Attributes:
@@ -122,8 +108,7 @@ class BagPlan:
         edges_ns: (E,) times, in ns since the Unix epoch, that divide the bag into intervals. An
             interval is a frame, or the time between two episodes. Interval i ends at edge i.
         counts: (E + 1, cubes) number of samples of each cube in each frame; 0 between episodes.
-        usual: Median number of samples of a cube in a frame that has any.
-        left_out: Numbers of samples and episodes that are not exported, by a text with the reason.
+        left_out: Number of samples that lie outside of the marks.
     """
 
     path: Path
@@ -131,8 +116,12 @@ class BagPlan:
     episodes: list[Episode]
     edges_ns: Times
     counts: AnyArray
-    usual: float
-    left_out: Counter[str]
+    left_out: int
+
+    @property
+    def blocks(self) -> list[range]:
+        """The blocks of frames of all episodes."""
+        return [block for episode in self.episodes for block in episode.blocks]
 
     def find_frames(self, stamp_ns: Times) -> Index:
         """Return the number (N,) of the interval (of `edges_ns`) in which each of N stamps lies."""
@@ -152,133 +141,94 @@ def plan_bag(path: Path, choices: Choices) -> BagPlan:
     """
     fps = choices.fps
     with open_bag(path, choices.frequencies) as source:
-        marks_ns, tasks = np.empty(0, np.int64), [choices.task]
-        if choices.marks is not None:
-            marks_ns, tasks = _read_marks(source.bag, choices.marks)
+        marks_ns, tasks = _read_marks(source.bag, choices)
         first_ns = np.full(len(tasks), MAX_TIME_NS)
         last_ns = -first_ns
-        for stamp_ns, cube in _read_samples(source):
-            known_ns = stamp_ns[cube < len(source.skin.cubes)]
-            index = np.searchsorted(marks_ns, known_ns, side="right")
-            np.minimum.at(first_ns, index, known_ns)
-            np.maximum.at(last_ns, index, known_ns)
+        for stamp_ns, _ in _read_samples(source):
+            mark = np.searchsorted(marks_ns, stamp_ns, side="right")
+            np.minimum.at(first_ns, mark, stamp_ns)
+            np.maximum.at(last_ns, mark, stamp_ns)
 
         recorded_s = (source.bag.end_ns - source.bag.start_ns) / SECOND
         max_frames = MAX_STAMP_RATIO * recorded_s * fps + ALWAYS_ALLOWED_COUNT
-        until_ns = np.append(marks_ns, MAX_TIME_NS)
         episodes: list[Episode] = []
         edges_ns = np.empty(0, np.int64)
-        seconds = 0.0
-        for mark in np.flatnonzero(first_ns <= last_ns):
-            if not tasks[mark]:
+        between = [0]
+        limits_ns = [*marks_ns, MAX_TIME_NS]
+        parts = zip(tasks, first_ns.tolist(), last_ns.tolist(), limits_ns, strict=True)
+        for task, begin_ns, end_ns, limit_ns in parts:
+            if not task or begin_ns > end_ns:
                 continue
-            begin_ns, end_ns = int(first_ns[mark]), int(last_ns[mark])
-            seconds += (end_ns - begin_ns) / SECOND
             n_frames = (end_ns - begin_ns) * fps // SECOND + 1
             if n_frames > max_frames:
                 raise BagError(
-                    f"{path}: a sample is stamped {seconds:.0f} s after the first of its episode, "
-                    "which is longer than was recorded: a clock was set; leave it out with --marks"
+                    f"{path}: a sample is stamped {n_frames / fps:.0f} s after the first of its "
+                    "episode, which is longer than was recorded: a clock was set; leave it out "
+                    "with --marks"
                 )
             # Interval 0 is the time before the first episode. Each episode adds one interval per
             # frame, and one for the time from its last frame to the next episode. Each interval
             # but the first has one edge, its begin. So after n edges, interval n + 1 is the next.
             first = len(edges_ns) + 1
-            episodes.append(
-                Episode(
-                    tasks[mark],
-                    begin_ns,
-                    range(first, first + n_frames),
-                )
-            )
+            frames = range(first, first + n_frames)
+            blocks = [frames[k : k + fps] for k in range(0, n_frames, fps)]
+            episodes.append(Episode(task, begin_ns, blocks))
+            between.append(frames.stop)
             # Rounding up gives the first whole ns of each frame. The next mark ends the last frame
             # of an episode.
             steps_ns = -(-np.arange(n_frames + 1) * SECOND // fps)
-            edges = np.minimum(begin_ns + steps_ns, until_ns[mark])
+            edges = np.minimum(begin_ns + steps_ns, limit_ns)
             edges_ns = np.append(edges_ns, edges)
 
-        # The last column counts the samples of cubes that the skin does not have.
-        counts = np.zeros((len(edges_ns) + 1, len(source.skin.cubes) + 1), np.uint32)
+        counts = np.zeros((len(edges_ns) + 1, len(source.skin.cubes)), np.uint32)
         for stamp_ns, cube in _read_samples(source):
             frame = np.searchsorted(edges_ns, stamp_ns, side="right")
             np.add.at(counts, (frame, cube), 1)
-    *known, unknown = counts.sum(axis=0).tolist()
-    between = [0, *(episode.frames.stop for episode in episodes)]
+    left_out = int(counts[between].sum())
     counts[between] = 0
-    used = counts[:, :-1]
-    left_out = {
-        "samples outside of the marks": sum(known) - int(used.sum()),
-        "samples of cubes that the skin does not have": unknown,
-        "marks without a sample": sum(map(bool, tasks)) - len(episodes),
-    }
-    usual = float(np.median(used[used > 0])) if episodes else 0.0
-    plan = BagPlan(
-        path,
-        source.skin,
-        episodes,
-        edges_ns,
-        used,
-        usual,
-        Counter(left_out),
-    )
-    if choices.marks is None or episodes:
-        _check_rate(plan, seconds, fps)
+    plan = BagPlan(path, source.skin, episodes, edges_ns, counts, left_out)
+    if episodes:
+        _check_counts(plan, fps)
     return plan
 
 
 def _read_samples(source: BagSource) -> Iterator[tuple[Times, Index]]:
-    """Yield the stamps and cube indices of all samples.
-
-    The index of cubes that the skin does not have is replaced by the number of cubes in the skin.
-    """
-    n_cubes = len(source.skin.cubes)
-    for stamp_ns, cube in source.bag.columns(
-        source.topic,
-        frequency_codec,
-        ("cube",),
-    ):
-        yield stamp_ns.astype(np.int64, copy=False), np.minimum(cube, n_cubes).astype(np.intp)
+    """Yield the stamps and cube indices of all samples of cubes that the skin has."""
+    for stamp_ns, cube in source.bag.columns(source.topic, frequency_codec, ("cube",)):
+        is_known = cube < len(source.skin.cubes)
+        yield stamp_ns[is_known].astype(np.int64, copy=False), cube[is_known].astype(np.intp)
 
 
-def _check_rate(plan: BagPlan, seconds: float, fps: int) -> None:
+def _check_counts(plan: BagPlan, fps: int) -> None:
     """Check that every frame can have a sample, and that no frame has far too many samples.
 
     Args:
-        plan: Episodes and frames of the bag.
-        seconds: Sum of the durations of the episodes, in s.
+        plan: Episodes and frames of the bag; at least one of each.
         fps: Frames per second.
 
     Raises:
-        BagError: No cube has two samples, the frame rate is above the sample rate, or a frame has
-            more samples than `MAX_DEPTH_RATIO` and `ALWAYS_ALLOWED_COUNT` allow.
+        BagError: The frame rate is above the sample rate, or a frame has more samples than
+            `MAX_DEPTH_RATIO` and `ALWAYS_ALLOWED_COUNT` allow.
     """
-    # Cubes with fewer samples are left out: they have no rate, and a hub that was not connected
-    # would lower the median of all cubes. In each episode, n samples enclose n - 1 periods.
-    periods = plan.counts.sum(axis=0, dtype=np.int64) - len(plan.episodes)
-    several = periods[periods > 0]
-    if not len(several) or seconds <= 0:
+    n_frames = sum(map(len, plan.blocks))
+    samples = plan.counts.sum(axis=0)
+    # A hub that was not connected must not lower the median of all cubes.
+    per_frame = float(np.median(samples[samples > 0])) / n_frames
+    if per_frame < 1:
+        rate = per_frame * fps
         raise BagError(
-            f"{plan.path}: {plan.counts.sum()} samples of frequencies, and no two of one cube; "
-            "record longer"
-        )
-    rate = float(np.median(several)) / seconds
-    # The rate counts periods. The n samples that enclose n - 1 periods are enough for n frames.
-    max_fps = math.floor(rate * (1 + 1 / several.min()))
-    if fps > max_fps:
-        raise BagError(
-            f"{plan.path}: --fps {fps}: the cubes were sampled {rate:.4g} times per second, so "
-            f"that frames would be without a sample; give at most {max_fps}"
+            f"{plan.path}: --fps {fps}: the cubes were sampled {rate:.3g} times per second, so "
+            f"that frames would be without a sample; give at most {math.floor(rate)}"
         )
     depth = plan.counts.max()
-    if depth > MAX_DEPTH_RATIO * plan.usual + ALWAYS_ALLOWED_COUNT:
-        cube = plan.counts.max(axis=0).argmax()
+    if depth > MAX_DEPTH_RATIO * per_frame + ALWAYS_ALLOWED_COUNT:
         raise BagError(
-            f"{plan.path}: {depth} samples of cube {plan.skin.names[cube]} in one frame, usual are "
-            f"{plan.usual:g}: stamps do not follow time; leave that time out with --marks"
+            f"{plan.path}: {depth} samples of a cube in one frame, usual are {per_frame:.3g}: "
+            "stamps do not follow time; leave that time out with --marks"
         )
 
 
-def _read_marks(bag: Bag, topic: str) -> tuple[Times, list[str]]:
+def _read_marks(bag: Bag, choices: Choices) -> tuple[list[int], list[str]]:
     """Read the marks that divide a bag.
 
     A mark is a recorded text. At the time of its recording it ends the episode before and begins a
@@ -286,25 +236,22 @@ def _read_marks(bag: Bag, topic: str) -> tuple[Times, list[str]]:
 
     Args:
         bag: Open bag.
-        topic: Topic of the marks.
+        choices: Topic of the marks, and the task of a bag without marks.
 
     Returns:
-        Time (M,) of recording of each mark, in ns since the Unix epoch. M + 1 texts: an empty one
-        for the time before the first mark, and the text of each mark.
+        Time of recording of each of M marks, in ns since the Unix epoch. M + 1 texts: the task
+        before the first mark, which is empty if there are marks, and the text of each mark.
 
     Raises:
-        BagError: The topic does not exist, or none of its marks has a text.
+        BagError: The topic does not exist.
     """
-    if topic not in bag.topics(MARK_TYPE):
-        names = ", ".join(bag.topics(MARK_TYPE)) or "none"
+    if choices.marks is None:
+        return [], [choices.task]
+    topics = bag.topics(MARK_TYPE)
+    if choices.marks not in topics:
+        names = ", ".join(topics) or "none"
         raise BagError(
-            f"{bag.path}: no marks ({MARK_TYPE}) on {topic}; topics of that type: {names}"
+            f"{bag.path}: no marks ({MARK_TYPE}) on {choices.marks}; topics of that type: {names}"
         )
-    times_ns, tasks = [], [""]
-    mark: String
-    for time_ns, mark in bag.read_decoded({topic}):
-        times_ns.append(time_ns)
-        tasks.append(mark.data.strip())
-    if not any(tasks):
-        raise BagError(f"{bag.path}: no mark on {topic} begins an episode; publish its task there")
-    return np.array(times_ns), tasks
+    marks: list[tuple[int, String]] = list(bag.read_decoded({choices.marks}))
+    return [time_ns for time_ns, _ in marks], ["", *(mark.data.strip() for _, mark in marks)]

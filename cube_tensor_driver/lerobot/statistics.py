@@ -45,14 +45,14 @@ def describe(rows: AnyArray, is_chosen: Mask) -> Part:
         is_chosen: (n,) whether each row is kept for the quantiles.
     """
     values = np.ma.masked_invalid(rows.astype(np.float64))
-    described = [
+    moments = [
         values.count(axis=0),
-        values.mean(axis=0).filled(0),
-        values.var(axis=0).filled(0),
-        values.min(axis=0).filled(np.inf),
-        values.max(axis=0).filled(-np.inf),
+        values.mean(axis=0),
+        values.var(axis=0),
+        values.min(axis=0),
+        values.max(axis=0),
     ]
-    return np.array(described), values[is_chosen].filled(np.nan)
+    return np.ma.stack(moments), values[is_chosen].filled(np.nan)
 
 
 def summarise(parts: Sequence[Part], frames: int) -> dict[str, list[object]]:
@@ -69,33 +69,26 @@ def summarise(parts: Sequence[Part], frames: int) -> dict[str, list[object]]:
     Returns:
         Each statistic, as nested lists of the shape of a row, by its name in LeRobot.
     """
-    described, samples = zip(*parts, strict=True)
-    count, means, variances, lows, highs = np.stack(described, axis=1)
-    total = count.sum(axis=0)
-    is_empty = total == 0
-    weight = count / np.maximum(total, 1)
-    mean = (weight * means).sum(axis=0)
+    moments, samples = zip(*parts, strict=True)
+    count, means, variances, lows, highs = np.ma.stack(moments, axis=1)
+    weight = count / np.maximum(count.sum(axis=0), 1)
+    mean = (weight * means).sum(axis=0).filled(0)
     # Law of total variance: the total variance is the mean of the variances within the parts plus
     # the variance of the means of the parts.
     squares = variances + (means - mean) ** 2
     variance = (weight * squares).sum(axis=0)
 
-    sample = np.concatenate(samples)
     # If a number is NaN in most rows, the sample may contain only NaN for it. Then its mean is used
     # for all of its quantiles.
+    sample = np.concatenate(samples)
     is_sampled = np.isfinite(sample).any(axis=0)
-    substitute = np.where(is_sampled, np.nan, mean)
-    known = np.concatenate([sample, substitute[np.newaxis]])
-    quantiles = np.nanquantile(
-        known,
-        list(QUANTILES.values()),
-        axis=0,
-    )
+    known = np.vstack([sample, np.where(is_sampled, np.nan, mean)[np.newaxis]])
+    quantiles = np.nanquantile(known, list(QUANTILES.values()), axis=0)
     statistics = {
-        "min": np.where(is_empty, 0, lows.min(axis=0)),
-        "max": np.where(is_empty, 0, highs.max(axis=0)),
+        "min": lows.min(axis=0).filled(0),
+        "max": highs.max(axis=0).filled(0),
         "mean": mean,
-        "std": np.where(is_empty, 1, np.sqrt(variance)),
+        "std": np.sqrt(variance).filled(1),
         **dict(zip(QUANTILES, quantiles, strict=True)),
     }
     return {"count": [frames]} | {name: value.tolist() for name, value in statistics.items()}

@@ -8,33 +8,35 @@ Each frame gets the newest message that is stamped before the end of the frame.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, is_dataclass
 from operator import attrgetter, itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rosbags.interfaces import Nodetype
 
+from ..bags.metadata import make_typestore
 from ..bags.read import Bag, list_message_fields, stamp_ns
 from ..core.arrays import Single, Times
 from ..core.errors import BagError
 from ..messages.types import PACKAGE
-from .images import IMAGE_TYPES, LEAVE_OUT, ImageStream, Shape, encode
+from .images import IMAGE_TYPES, LEAVE_OUT, Shape, encode, make_black_image
 from .plan import Choices
 
 if TYPE_CHECKING:
     from geometry_msgs.msg import WrenchStamped
-    from rosbags.interfaces.typing import Fielddefs
-    from sensor_msgs.msg import JointState
-
+    from sensor_msgs.msg import CompressedImage, Image, JointState
 
 JOINT_STATE_TYPE = "sensor_msgs/msg/JointState"
 """Message type of joint states: names, positions, velocities and efforts of a robot's joints."""
 
 HEADER_KIND = (Nodetype.NAME, "std_msgs/msg/Header")
 """Type, as the library rosbags describes it, of the field with a message's header and stamp."""
+
+LIST_SIGNS = ("[]", "[<=")
+"""Signs of lists of variable length in the definition of a message type."""
 
 JOINT_FIELDS = ("position", "velocity", "effort")
 """Fields of a JointState message that have one number per joint."""
@@ -54,105 +56,110 @@ class Topic:
     Attributes:
         name: Name of the topic.
         msgtype: Type of its messages.
-        key: Name of the feature.
-        shape: Height, width and number of bands of its images; one pixel if there is no image.
+        shape: Height, width and number of bands of its images; None until one has been read.
         names: Names of the numbers in all of its messages; empty for images.
     """
 
     name: str
     msgtype: str
-    key: str
-    shape: Shape = (1, 1, 1)
+    shape: Shape | None = None
     names: dict[str, None] = field(default_factory=dict)
-
-    @property
-    def is_image(self) -> bool:
-        """Whether the messages of the topic are images."""
-        return self.msgtype in IMAGE_TYPES
 
     def describe(self, bag: Bag) -> None:
         """Read the messages in a bag, to extend `names` or, for images, to set `shape`."""
-        if not self.is_image:
+        if self.msgtype not in IMAGE_TYPES:
             # Bags may contain different joints, so the feature gets the joints of all bags.
-            for _, numbers in _read_numbers(bag, self):
+            for _, numbers in self._read_numbers(bag):
                 self.names |= dict.fromkeys(numbers)
-        elif self.shape == Topic.shape:
+        elif self.shape is None:
             for _, message in bag.read_decoded({self.name}):
                 _, self.shape = encode(message, f"{bag.path}: {self.name}")
                 return
 
-    def open(self, bag: Bag) -> ImageStream | Signal:
-        """Read the topic's numbers in a bag, or prepare to read its images there.
+    def sample(self, bag: Bag, blocks: Iterable[Times]) -> Iterator[Single | list[bytes]]:
+        """Yield the newest values before the ends of some frames, one block of frames at a time.
 
-        Images are read one by one when their frames are written, because a recording of images can
-        be larger than the memory.
-        """
-        if self.is_image:
-            return ImageStream(
-                bag,
-                self.name,
-                self.shape,
-            )
-        return Signal(bag, self)
-
-
-class Signal:
-    """The numbers in all messages on a topic of one bag."""
-
-    def __init__(self, bag: Bag, topic: Topic) -> None:
-        """Read the numbers, such as joint positions, from all messages on the topic.
+        Before the first message, numbers are NaN and images are black. So they are in bags that do
+        not have the topic.
 
         Args:
             bag: Open bag.
-            topic: The topic. Its `names` must contain the numbers of every bag of the data set (see
-                `Topic.describe`), because each name becomes a column for every bag.
+            blocks: (frames,) ends of frames in rising order, in ns since the Unix epoch.
+
+        Yields:
+            The numbers (frames, numbers), or the contents of the image files.
 
         Raises:
-            BagError: The bag is damaged, or a JointState has more or fewer values than joint names.
+            BagError: The bag is damaged, a message has more or fewer values than joints, or an
+                image cannot be read or has another shape than the first one.
         """
-        messages = sorted(_read_numbers(bag, topic), key=itemgetter(0))
-        self._stamp_ns: Times = np.array([stamp for stamp, _ in messages], np.int64)
+        if self.shape is None:
+            yield from self._sample_numbers(bag, blocks)
+            return
+        where = f"{bag.path}: {self.name}"
+        file = make_black_image(self.shape)
+        # Images are read one by one, because a recording of images can be larger than the memory.
+        messages: Iterator[tuple[int, Image | CompressedImage]] = bag.read_decoded({self.name})
+        following: Image | CompressedImage | None
+        _, following = next(messages, (0, None))
+        for ends_ns in blocks:
+            files = []
+            for end_ns in ends_ns:
+                newest = None
+                while following is not None and stamp_ns(following) < end_ns:
+                    newest = following
+                    _, following = next(messages, (0, None))
+                # Only the last image before the end is encoded, because encoding is slow.
+                if newest is not None:
+                    file, shape = encode(newest, where)
+                    if shape != self.shape:
+                        raise BagError(
+                            f"{where}: an image of {shape} after ones of {self.shape}; {LEAVE_OUT}"
+                        )
+                files.append(file)
+            yield files
+
+    def _sample_numbers(self, bag: Bag, blocks: Iterable[Times]) -> Iterator[Single]:
+        """Yield the newest numbers before the ends of some frames; see `sample`."""
+        messages = sorted(self._read_numbers(bag), key=itemgetter(0))
+        stamps_ns = [stamp for stamp, _ in messages]
         # Row k has the numbers that hold after k messages. A JointState may contain only some of
         # the joints. The others keep their latest values, which are NaN until a message has them.
-        latest = dict.fromkeys(topic.names, np.nan)
-        self._values: Single = np.full(
-            (len(messages) + 1, len(latest)),
-            np.nan,
-            np.float32,
-        )
-        for row, (_, numbers) in enumerate(messages, 1):
+        latest = dict.fromkeys(self.names, np.nan)
+        rows = [list(latest.values())]
+        for _, numbers in messages:
             latest |= numbers
-            self._values[row] = list(latest.values())
+            rows.append(list(latest.values()))
+        values = np.array(rows, np.float32)
+        for ends_ns in blocks:
+            yield values[np.searchsorted(stamps_ns, ends_ns)]
 
-    def at(self, ends_ns: Times) -> Single:
-        """Return the newest values (frames, numbers) before the end of each frame.
+    def _read_numbers(self, bag: Bag) -> Iterator[tuple[int, dict[str, float]]]:
+        """Yield the stamp, in ns, and the numbers by their names of each message."""
+        messages: Iterator[tuple[int, JointState | WrenchStamped]] = bag.read_decoded({self.name})
+        for _, message in messages:
+            if self.msgtype == JOINT_STATE_TYPE:
+                numbers = _find_joint_numbers(message, f"{bag.path}: {self.name}")
+            else:
+                numbers = _find_numbers(vars(message), "")
+            yield stamp_ns(message), numbers
 
-        They are NaN before the first message, and for numbers that the bag does not have.
 
-        Args:
-            ends_ns: (frames,) ends of frames, in ns since the Unix epoch.
-        """
-        n_before = np.searchsorted(self._stamp_ns, ends_ns)
-        return self._values[n_before]
-
-
-def find_topics(paths: Sequence[Path], choices: Choices) -> list[Topic]:
+def find_topics(paths: Sequence[Path], choices: Choices) -> dict[str, Topic]:
     """Find the topics of the bags that become features of a data set.
 
     Args:
         paths: Folders or files of the bags.
         choices: Topics that the user chose.
 
+    Returns:
+        The topics by the names of the features.
+
     Raises:
         BagError: A chosen topic does not exist in any bag, or its type differs between bags.
     """
     found: dict[str, Topic] = {}
-    existing: set[str] = set()
-    named = [
-        *(choices.topics or ()),
-        choices.state,
-        choices.action,
-    ]
+    named = [*(choices.topics or ()), choices.state, choices.action]
     wanted = {topic for topic in named if topic}
     for path in paths:
         with Bag(path) as bag:
@@ -163,105 +170,68 @@ def find_topics(paths: Sequence[Path], choices: Choices) -> list[Topic]:
                 name, msgtype = one.topic, one.msgtype
                 if not one.msgcount or name.startswith(cubes) or not _is_usable(msgtype):
                     continue
-                existing.add(name)
-                if choices.topics is not None and name not in wanted:
-                    continue
-                kind = "images" if msgtype in IMAGE_TYPES else "topics"
-                key = f"observation.{kind}.{name.strip('/').replace('/', '.')}"
-                topic = found.setdefault(
-                    name,
-                    Topic(
-                        name,
-                        msgtype,
-                        key,
-                    ),
-                )
+                topic = found.setdefault(name, Topic(name, msgtype))
                 if topic.msgtype != msgtype:
                     raise BagError(
                         f"{path}: {name} is {msgtype}, in other bags {topic.msgtype}; {LEAVE_OUT}"
                     )
-                topic.describe(bag)
-    missing = sorted(wanted - found.keys())
+                if choices.topics is None or name in wanted:
+                    topic.describe(bag)
+    # Topics that were not chosen have not been described. JointState messages may have no joints.
+    used = [topic for topic in found.values() if topic.names or topic.shape]
+    missing = sorted(wanted.difference(topic.name for topic in used))
     if missing:
         raise BagError(
             f"{paths[0]}: no images and no stamped numbers on {', '.join(missing)}; there are "
-            f"{', '.join(sorted(existing)) or 'none'}"
+            f"{', '.join(sorted(found)) or 'none'}"
         )
-    # JointState messages may contain no joints; such a topic has no numbers and is left out.
-    used: dict[str | None, Topic] = {
-        name: topic for name, topic in found.items() if topic.names or topic.is_image
-    }
-    joints = [name for name, topic in used.items() if topic.msgtype == JOINT_STATE_TYPE]
     # If there are several topics of joint states, only the user can decide which one is the state.
+    joints = [topic.name for topic in used if topic.msgtype == JOINT_STATE_TYPE]
     others = [name for name in joints if name != choices.action]
     state = choices.state or (others[0] if len(others) == 1 else None)
-    for chosen, key in ((choices.action, ACTION_FEATURE), (state, STATE_FEATURE)):
-        if chosen in used:
-            used[chosen].key = key
-    return list(used.values())
+    chosen = {choices.action: ACTION_FEATURE, state: STATE_FEATURE}
+    features: dict[str, Topic] = {}
+    for topic in used:
+        kind = "images" if topic.shape else "topics"
+        key = f"observation.{kind}.{topic.name.strip('/').replace('/', '.')}"
+        features[chosen.get(topic.name, key)] = topic
+    return features
 
 
 def _is_usable(msgtype: str) -> bool:
-    """Return whether messages of a type can become a feature."""
-    return msgtype in (JOINT_STATE_TYPE, *IMAGE_TYPES) or bool(_number_paths(msgtype))
+    """Return whether messages of a type can become a feature.
 
-
-def _read_numbers(
-    bag: Bag,
-    topic: Topic,
-) -> Iterator[tuple[int, dict[str, float]]]:
-    """Yield the stamp, in ns, and the numbers by their names of each message on a topic."""
-    paths = _number_paths(topic.msgtype)
-    messages: Iterator[tuple[int, JointState | WrenchStamped]] = bag.read_decoded({topic.name})
-    for _, message in messages:
-        if topic.msgtype == JOINT_STATE_TYPE:
-            numbers = _find_joint_numbers(message, f"{bag.path}: {topic.name}")
-        else:
-            numbers = {}
-            for path in paths:
-                value = attrgetter(path)(message)
-                if np.ndim(value):
-                    numbers |= {f"{path}.{k}": float(one) for k, one in enumerate(value)}
-                else:
-                    numbers[path] = float(value)
-        yield stamp_ns(message), numbers
-
-
-def _number_paths(msgtype: str) -> list[str]:
-    """Return the paths of the numbers in messages of a type, such as ``wrench.force.x``.
-
-    The list is empty if the type has no header (and therefore no stamp), contains a list of
-    variable length, or belongs to this package.
+    They can if they are images or joint states, or have a header, and therefore a stamp, but no
+    list of variable length. Messages of this package cannot.
     """
-    fields = list_message_fields(msgtype)
-    if not fields or fields[0][1] != HEADER_KIND or msgtype.startswith(PACKAGE):
-        return []
-    paths = list(_find_nested_paths(fields[1:], ""))
-    return [] if None in paths else [path for path in paths if path]
+    if msgtype in (JOINT_STATE_TYPE, *IMAGE_TYPES):
+        return True
+    described = list_message_fields(msgtype)
+    if not described or described[0][1] != HEADER_KIND or msgtype.startswith(PACKAGE):
+        return False
+    definition, _ = make_typestore().generate_msgdef(msgtype, ros_version=2)
+    return not any(sign in definition for sign in LIST_SIGNS)
 
 
-def _find_nested_paths(fields: Fielddefs, prefix: str) -> Iterator[str | None]:
-    """Yield the paths of the numbers in some fields, including those in nested messages.
+def _find_numbers(parts: Mapping[Any, Any], prefix: str) -> dict[str, float]:
+    """Return the numbers in a message by their paths, such as ``wrench.force.x``.
 
     Args:
-        fields: Name and kind (type, as the library rosbags describes it) of each field, as
-            `list_message_fields` returns them.
-        prefix: Path from the outermost message to these fields, ending in "."; "" if they are the
-            fields of the outermost message itself.
-
-    Yields:
-        Path of a number or of a list of numbers of fixed length; None for a field of another kind,
-        such as a list of variable length.
+        parts: Fields of a message by name, or entries of a list by index.
+        prefix: Path from the outermost message to these parts, ending in "."; "" for its fields.
     """
-    for name, field_kind in fields:
-        # For a list of fixed length, the second element of its kind is (kind of element, length).
-        kind = field_kind[1][0] if field_kind[0] == Nodetype.ARRAY else field_kind
-        if field_kind[0] == Nodetype.NAME:
-            yield from _find_nested_paths(list_message_fields(field_kind[1]), f"{prefix}{name}.")
-        elif kind[0] != Nodetype.BASE:
-            yield None
-        elif kind[1][0] != "string":
-            yield f"{prefix}{name}"
+    numbers: dict[str, float] = {}
+    for name, part in parts.items():
+        if name == "header" or isinstance(part, str):
+            continue
+        path = f"{prefix}{name}"
+        if is_dataclass(part):
+            numbers |= _find_numbers(vars(part), f"{path}.")
+        elif np.ndim(part):
+            numbers |= _find_numbers(dict(enumerate(part)), f"{path}.")
+        else:
+            numbers[path] = float(part)
+    return numbers
 
 
 def _find_joint_numbers(message: JointState, where: str) -> dict[str, float]:
@@ -274,19 +244,14 @@ def _find_joint_numbers(message: JointState, where: str) -> dict[str, float]:
     Raises:
         BagError: The message has more or fewer values of a quantity than joint names.
     """
-    numbers = {}
-    joints = message.name
+    numbers: dict[str, float] = {}
     for quantity in JOINT_FIELDS:
         values = getattr(message, quantity)
-        if len(values) not in (0, len(joints)):
+        if len(values) not in (0, len(message.name)):
             raise BagError(
-                f"{where}: a message has {len(joints)} joints and {len(values)} values of "
+                f"{where}: a message has {len(message.name)} joints and {len(values)} values of "
                 f"{quantity}; {LEAVE_OUT}"
             )
-        for joint, value in zip(
-            joints,
-            values,
-            strict=False,
-        ):
-            numbers[f"{joint}.{quantity}"] = float(value)
+        names = [f"{joint}.{quantity}" for joint in message.name]
+        numbers |= zip(names, map(float, values), strict=False)
     return numbers

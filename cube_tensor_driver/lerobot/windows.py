@@ -10,7 +10,6 @@ from itertools import chain
 import numpy as np
 
 from ..core.arrays import AnyArray, Index
-from ..core.modes import COMPONENTS
 from ..core.rows import COLUMN_TYPES, StressRows, concatenate
 
 TACTILE = "observation.tactile"
@@ -37,34 +36,29 @@ def stream_windows(
 
     Args:
         parts: Frame number (N,) of N rows, and the rows.
-        blocks: Ranges of frame numbers, in rising order. Rows of other frames are left out.
+        blocks: Ranges of frame numbers, in rising order, that contain the frames of all rows.
         counts: (frames, cubes) number of rows of each cube in each frame.
         depth: Number of samples of each cube that a window has room for.
 
     Yields:
         Features of the frames of each block, as `arrange_windows` returns them.
     """
-    waiting: list[tuple[Index, StressRows]] = []
     unread = iter(parts)
+    waiting: list[tuple[Index, StressRows]] = []
     for block in blocks:
-        begin, end = block.start, block.stop
-        missing = int(counts[begin:end].sum())
-        frames, rows = [], []
-        for frame, part in chain(waiting, unread):
-            frames.append(frame)
-            rows.append(part)
-            missing -= np.count_nonzero((begin <= frame) & (frame < end))
+        missing = counts[block.start : block.stop].sum()
+        taken = []
+        for frame, rows in chain(waiting, unread):
+            taken.append((frame, rows))
+            missing -= np.count_nonzero(frame < block.stop)
             if missing <= 0:
                 break
-        frame, part = np.concatenate(frames), concatenate(rows)
-        inside = (begin <= frame) & (frame < end)
-        yield arrange_windows(
-            frame[inside] - begin,
-            part.select(inside),
-            (len(block), depth, counts.shape[1]),
-        )
-        later = frame >= end
-        waiting = [(frame[later], part.select(later))]
+        frames, tables = zip(*taken, strict=True)
+        frame, rows = np.concatenate(frames), concatenate(tables)
+        is_due = frame < block.stop
+        shape = len(block), depth, counts.shape[1]
+        yield arrange_windows(frame[is_due] - block.start, rows.select(is_due), shape)
+        waiting = [(frame[~is_due], rows.select(~is_due))]
 
 
 def arrange_windows(
@@ -95,17 +89,13 @@ def arrange_windows(
     to_end = counts.cumsum()[cell] - np.arange(len(cell))
     place = cell // n_cubes, depth - to_end, cell % n_cubes
 
-    tactile: AnyArray = np.full(
-        (*shape, len(COMPONENTS)),
-        np.nan,
-        np.float32,
-    )
-    tactile[place] = rows.components[order]
-    windows = {TACTILE: tactile}
+    columns = {TACTILE: rows.components.astype(np.float32)}
     for name, kind in WINDOW_COLUMNS.items():
-        empty = np.nan if kind is np.float32 else 0
-        column: AnyArray = np.full(shape, empty, kind)
-        column[place] = getattr(rows, name)[order]
-        windows[f"{TACTILE}.{name}"] = column
+        columns[f"{TACTILE}.{name}"] = getattr(rows, name).astype(kind)
+    windows: dict[str, AnyArray] = {}
+    for key, values in columns.items():
+        empty = np.nan if values.dtype == np.float32 else 0
+        windows[key] = np.full((*shape, *values.shape[1:]), empty, values.dtype)
+        windows[key][place] = values[order]
     windows[f"{TACTILE}.count"] = counts.reshape(n_frames, n_cubes)
     return windows
