@@ -36,6 +36,9 @@ The number is the time at which the frame was read, in ms since the Unix epoch, 
 of all recordings have different numbers.
 """
 
+NUMBER_NS = 1_000_000
+"""Unit, in ns, of the time that is the number of a frame."""
+
 NUMBER_BYTES = 6
 """Size, in bytes, of a frame number (time in ms since the Unix epoch). Its 48 bits suffice beyond
 the year 10000."""
@@ -55,21 +58,11 @@ MIN_HEIGHT = 4 * MIN_SQUARE
 """Smallest height of a picture, in pixels, so that the frame number, which is two rows of squares
 (`NUMBER_GRID`), covers at most half of it."""
 
-MAX_AGE_NS = 5_000_000
-"""Maximum age, in ns, of the newest sample when a frame is made. `take_next_picture` waits for a
-newer one, but at most for `CATCH_UP_S`.
+MAX_ARRIVAL_MS = 250
+"""Longest time, in ms, by which a sample may arrive after a frame and still get into its window.
+Samples that arrive later get into the oldest window that has not been written.
 
-If the sampling period is longer, the period is the maximum age, because no newer sample need exist.
-"""
-
-CATCH_UP_S = 0.02
-"""Longest time, in s, for which `take_next_picture` waits until no unread sample is older than
-`MAX_AGE_NS`.
-
-A sample passes through two threads, and Python runs only one thread at a time. While the recorder
-or its writers of images compute, each of the two waits up to 5 ms for its turn
-(`sys.getswitchinterval`), and on a busy computer longer. At 30 frames per second, the limit leaves
-13 of the 33 ms of a frame to the recorder.
+A sample passes through two threads, which a busy computer holds up.
 """
 
 UNKNOWN_GREY = 90
@@ -79,10 +72,12 @@ UNKNOWN_GREY = 90
 class LiveWindows:
     """Writes the stress of a live skin to a file, one window for each frame.
 
-    The window of a frame consists of all samples since the frame before. A thread collects samples
-    as they arrive, whatever the recorder does meanwhile. Windows may differ in length, so a pause
-    of the recorder makes only one window longer. The file is FOLDER/NUMBER.arrow, with the number
-    of the first frame. It is an Arrow stream, which stays readable if the program is killed.
+    The window of a frame consists of the samples with stamps up to its frame number (a time) that
+    are in no earlier window. It is written `MAX_ARRIVAL_MS` later, so that samples that are still
+    on their way when the frame is read get into it. A thread collects samples as they arrive,
+    whatever the recorder does meanwhile. Windows may differ in length, so a pause of the recorder
+    makes only one window longer. The file is FOLDER/NUMBER.arrow, with the number of the first
+    frame. It is an Arrow stream, which stays readable if the program is killed.
     """
 
     def __init__(
@@ -119,25 +114,24 @@ class LiveWindows:
         self._folder = folder
         self._source = source
         self._full_scale = full_scale
-        self._cube_at = find_nearest_cubes(
-            source.skin,
-            width,
-            height,
-        )
+        self._cube_at = find_nearest_cubes(source.skin, width, height)
+        self._writer: pyarrow.ipc.RecordBatchStreamWriter | None = None
+        self._failure: CubeError | None = None
+        self._arrived: SimpleQueue[StressRows] = SimpleQueue()
         self._level = np.full(len(source.skin.cubes), np.nan)
         self._number = 0
-        self._writer: pyarrow.ipc.RecordBatchStreamWriter | None = None
-        rate = source.skin.rate
-        self._max_age_ns = max(MAX_AGE_NS, round(1e9 / rate) if rate else 0)
-        self._arrived: SimpleQueue[StressRows | CubeError] = SimpleQueue()
+        # Numbers of the frames whose windows have not been written, and the rows for them.
+        self._unwritten: list[int] = []
+        self._rows: list[StressRows] = []
         self._thread = threading.Thread(target=self._collect, daemon=True)
         self._thread.start()
 
     def take_next_picture(self, timeout_s: float) -> AnyArray:
-        """Write all samples since the last call as one window and return the frame's picture.
+        """Begin a frame and return its picture.
 
         Args:
-            timeout_s: Longest time, in s, to wait for a sample if there is none.
+            timeout_s: Longest time, in s, to wait for a sample if none has arrived since the frame
+                before.
 
         Returns:
             Picture (height, width, 3) of 8 bits: the newest pressure of each cube in red, tension
@@ -147,41 +141,24 @@ class LiveWindows:
             TimeoutError: No sample arrived.
             CubeError: The thread that reads the links has failed.
         """
-        wanted_ns = time.time_ns() - self._max_age_ns
-        end_s = time.monotonic() + min(CATCH_UP_S, timeout_s)
-        parts: list[StressRows] = []
-        newest_ns = 0
-        while newest_ns < wanted_ns or not self._arrived.empty():
-            wait_s = max(0.0, end_s - time.monotonic()) if parts else timeout_s
-            try:
-                part = self._arrived.get(timeout=wait_s)
-            except Empty:
-                break
-            if isinstance(part, CubeError):
-                # The error is put back, so that later calls raise it, too.
-                self._arrived.put(part)
-                if parts:
-                    break
-                raise part
-            parts.append(part)
-            newest_ns = int(part.stamp_ns.max(initial=0))
-        if not parts:
-            raise TimeoutError(
+        try:
+            self._rows.append(self._arrived.get(timeout=timeout_s))
+        except Empty:
+            raise self._failure or TimeoutError(
                 f"skin {self._source.skin.name}: no sample in {timeout_s:g} s; check that the hubs "
                 "are connected and that no other program reads them"
-            )
-        rows = concatenate(parts)
+            ) from None
         # Frame numbers must rise, although the clock of the computer may be set back.
-        self._number = max(self._number + 1, time.time_ns() // 1_000_000)
-        self._write(rows)
-        # In an assignment with repeated indices numpy keeps the last value, which is the newest.
-        self._level[rows.cube] = -rows.stress[:, 2] / self._full_scale
+        self._number = max(self._number + 1, time.time_ns() // NUMBER_NS)
+        self._unwritten.append(self._number)
+        self._write_windows(self._number - MAX_ARRIVAL_MS)
         return self._make_picture()
 
     def close(self) -> None:
         """Close the links and complete the file. Samples after the last frame are left out."""
         self._source.close()
         self._thread.join()
+        self._write_windows(self._number)
         if self._writer is not None:
             self._writer.close()
             # `close` has ended the stream. The file is closed when the writer is deleted.
@@ -191,52 +168,45 @@ class LiveWindows:
         """Reconstruct the stress of all samples as they arrive; runs in a thread of its own."""
         reconstruct = Reconstructor(self._source.skin)
         try:
-            for rows in self._source:
-                self._arrived.put(reconstruct(rows))
+            for frequencies in self._source:
+                rows = reconstruct(frequencies)
+                # Where a cube occurs repeatedly, numpy keeps the last value, which is the newest.
+                self._level[rows.cube] = -rows.stress[:, 2] / self._full_scale
+                self._arrived.put(rows)
         except CubeError as error:
-            self._arrived.put(error)
+            self._failure = error
 
-    def _write(self, rows: StressRows) -> None:
-        """Write the rows (samples of cubes) of one frame as one batch of the Arrow stream."""
-        n_cubes = len(self._level)
-        depth = int(np.bincount(rows.cube, minlength=1).max())
-        first_frame = np.zeros(len(rows), np.intp)
-        columns = arrange_windows(
-            first_frame,
-            rows,
-            (1, depth, n_cubes),
-        )
-        arrays = {name: as_column(values) for name, values in columns.items()}
-        arrays[NUMBER_COLUMN] = pyarrow.array([self._number])
-        batch = pyarrow.record_batch(arrays)
-        if self._writer is None:
-            path = self._folder / f"{self._number}.arrow"
-            self._writer = pyarrow.ipc.new_stream(str(path), batch.schema)
-        self._writer.write_batch(batch)
+    def _write_windows(self, last: int) -> None:
+        """Write the windows of the frames up to the number `last` to the Arrow stream."""
+        while not self._arrived.empty():
+            self._rows.append(self._arrived.get())
+        while self._unwritten and self._unwritten[0] <= last:
+            number = self._unwritten.pop(0)
+            rows = concatenate(self._rows)
+            is_inside = rows.stamp_ns <= NUMBER_NS * number
+            self._rows = [rows.select(~is_inside)]
+            rows = rows.select(is_inside)
+            # A window has at least one place for samples, even if it has no sample.
+            depth = int(np.bincount(rows.cube, minlength=1).max(initial=1))
+            first_frame = np.zeros(len(rows), np.intp)
+            columns = arrange_windows(first_frame, rows, (1, depth, len(self._level)))
+            columns[NUMBER_COLUMN] = np.array([number])
+            batch = pyarrow.record_batch({name: as_column(one) for name, one in columns.items()})
+            if self._writer is None:
+                path = self._folder / f"{number}.arrow"
+                self._writer = pyarrow.ipc.new_stream(str(path), batch.schema)
+            self._writer.write_batch(batch)
 
     def _make_picture(self) -> AnyArray:
         """Return the picture of the newest pressures, with the frame number at the top."""
-        red = np.clip(self._level, 0.0, 1.0)
-        blue = np.clip(-self._level, 0.0, 1.0)
-        colours = 255 * np.column_stack(
-            [
-                red,
-                np.zeros_like(red),
-                blue,
-            ]
-        )
-        colours[np.isnan(red)] = UNKNOWN_GREY
-        picture = colours.astype(np.uint8)[self._cube_at]
+        red_and_blue = np.outer(self._level, [1, 0, -1])
+        colours = np.nan_to_num(255 * np.clip(red_and_blue, 0, 1), nan=UNKNOWN_GREY)
+        picture: AnyArray = colours.astype(np.uint8)[self._cube_at]
 
         number_bytes = self._number.to_bytes(NUMBER_BYTES, "big")
-        bits = np.unpackbits(np.frombuffer(number_bytes, np.uint8))
+        bits = np.unpackbits(np.frombuffer(number_bytes, np.uint8)).reshape(NUMBER_GRID)
         side = picture.shape[1] // NUMBER_GRID[1]
-        square = np.full(
-            (MIN_SQUARE, side),
-            255,
-            np.uint8,
-        )
-        squares = np.kron(bits.reshape(NUMBER_GRID), square)
+        squares = np.kron(bits, np.full((MIN_SQUARE, side), 255, np.uint8))
         rows, columns = squares.shape
         picture[:rows, :columns] = squares[..., np.newaxis]
         return picture
@@ -263,10 +233,6 @@ class RecordedWindows:
             file = pyarrow.memory_map(str(path))
             for batch in pyarrow.ipc.open_stream(file):
                 self._frames[batch[NUMBER_COLUMN][0].as_py()] = batch
-
-    def __len__(self) -> int:
-        """Return the number of frames that were read, including those that no data set kept."""
-        return len(self._frames)
 
     def of(self, picture: AnyArray) -> dict[str, AnyArray]:
         """Return the window that was recorded with a picture.
@@ -302,14 +268,9 @@ def read_frame_number(picture: AnyArray) -> int:
     grey = pixels.mean(axis=0 if len(pixels) == 3 else 2)
     rows, columns = NUMBER_GRID
     side = grey.shape[1] // columns
-    strip = grey[: rows * MIN_SQUARE, : columns * side]
-    by_square = strip.reshape(
-        rows,
-        MIN_SQUARE,
-        columns,
-        side,
-    )
-    squares = by_square.mean(axis=(1, 3))
+    centre_rows = slice(MIN_SQUARE // 2, rows * MIN_SQUARE, MIN_SQUARE)
+    centre_columns = slice(side // 2, columns * side, side)
+    squares = grey[centre_rows, centre_columns]
     # Pixels may be scaled to 0 to 1 or 0 to 255. Every frame number has black and white squares, so
     # the threshold is half way between the darkest and the brightest one.
     threshold = 0.5 * (squares.min() + squares.max())
