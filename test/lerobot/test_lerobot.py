@@ -10,6 +10,7 @@ import json
 import os
 import shutil
 import subprocess
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from bag_maker import START_NS, frequencies_of, header, make_bag, message
 from PIL import Image
 
 from cube_tensor_driver.bags.metadata import make_typestore
-from cube_tensor_driver.bags.read import Bag
+from cube_tensor_driver.bags.read import Bag, Entry
 from cube_tensor_driver.bags.reprocess.job import ReprocessJob, make_table, reprocess
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.cli.main import main
@@ -96,12 +97,17 @@ def others() -> list[tuple[str, int, object]]:
     return found
 
 
-def with_others(plain: Path, folder: Path, added: list[tuple[str, int, object]]) -> Path:
-    """A copy of a bag, with more messages in it: topic, time of recording, message."""
+def with_others(
+    plain: Path,
+    folder: Path,
+    added: list[tuple[str, int, object]],
+    change: Callable[[int, Entry], bytes] = lambda number, entry: entry.data,
+) -> Path:
+    """A copy of a bag with changed messages, and with more: topic, time of recording, message."""
     store = make_typestore()
     with Bag(plain) as bag:
         entries = list(bag.entries())
-    entries = [(one.topic, one.msgtype, one.time_ns, one.data) for one in entries]
+    entries = [(*one[:3], change(number, one)) for number, one in enumerate(entries)]
     for topic, time_ns, one in added:
         data = bytes(store.serialize_cdr(one, one.__msgtype__))
         entries.append((topic, one.__msgtype__, time_ns, data))
@@ -113,17 +119,23 @@ def with_others(plain: Path, folder: Path, added: list[tuple[str, int, object]])
     return folder
 
 
+def export(folder: Path, bags: list[Path], *options: str, fps: int = FPS) -> dict[str, np.ndarray]:
+    """Every column of the data set of some bags, which is written to a folder."""
+    command = ["export", "lerobot", *map(str, bags), "-o", str(folder), "--fps", str(fps)]
+    assert main([*command, *options]) == 0
+    return read_frames(folder)
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A bag, the table of its stress by `reprocess`, and the data set made of it."""
+    """A bag, the table of its stress by `reprocess`, and the folder of the data set made of it."""
     folder = tmp_path_factory.mktemp("lerobot")
     stuck = lambda k: np.where(np.arange(16) == 3, (1 << 2) * (k >= 80), 0)  # noqa: E731
     plain = make_bag(folder / "plain", SKIN, left_out=stuck)
     bag = with_others(plain, folder / "bag", others())
     reprocess(ReprocessJob(bag, folder / "bag.parquet", "parquet"))
     table = pyarrow.parquet.read_table(folder / "bag.parquet")
-    command = ["export", "lerobot", str(bag), "-o", str(folder / "set"), "--fps", str(FPS)]
-    assert main([*command, "--task", "stroke the cat"]) == 0
+    export(folder / "set", [bag], "--task", "stroke the cat")
     return bag, table, folder / "set"
 
 
@@ -177,14 +189,6 @@ def test_windows_hold_every_sample_once_with_the_bits_of_reprocess(made, frames)
     stamp_ns = frames[f"{TACTILE}.stamp_ns"] - START_NS
     frame = np.broadcast_to(frames["frame_index"][:, :, None], stamp_ns.shape)[filled]
     assert (stamp_ns[filled] * FPS // 10**9 == frame).all()
-
-
-def test_every_frame_is_counted(frames):
-    number = np.arange(90)
-    for name in ("frame_index", "index"):
-        np.testing.assert_array_equal(frames[name][:, 0], number)
-    np.testing.assert_array_equal(frames["timestamp"][:, 0], (number / FPS).astype(np.float32))
-    assert not frames["episode_index"].any() and not frames["task_index"].any()
 
 
 def test_other_topics_have_the_newest_before_the_end_of_each_frame(made, frames):
@@ -245,28 +249,19 @@ def test_statistics_are_those_of_all_samples(made):
     _, table, folder = made
     stats = json.loads((folder / "meta" / "stats.json").read_text())
     zz = table["stress_zz_Pa"].to_numpy().astype(float)
-    ours = {
-        name: values[COMPONENTS.index("zz")]
-        for name, values in stats[TACTILE].items()
-        if name != "count"
-    }
+    at = COMPONENTS.index("zz")
+    ours = {name: values[at] for name, values in stats[TACTILE].items() if name != "count"}
     assert ours["min"] == zz.min() and ours["max"] == zz.max()
     np.testing.assert_allclose([ours["mean"], ours["std"]], [zz.mean(), zz.std()], rtol=1e-9)
     assert ours["q50"] == np.median(zz)
-    yz = {
-        name: values[COMPONENTS.index("yz")]
-        for name, values in stats[TACTILE].items()
-        if name != "count"
-    }
-    assert yz["mean"] == 0 and yz["std"] == 1  # planar cubes never observe it
+    at = COMPONENTS.index("yz")  # planar cubes never observe it
+    assert (stats[TACTILE]["mean"][at], stats[TACTILE]["std"][at]) == (0, 1)
     assert np.shape(stats["observation.images.camera.image_raw"]["mean"]) == (3, 1, 1)
 
 
 def test_marks_divide_a_bag_into_episodes(made, tmp_path, capsys):
     bag, table, _ = made
-    command = ["export", "lerobot", str(bag), str(bag), "-o", str(tmp_path / "set")]
-    assert main([*command, "--fps", "30", "--marks", MARKS, "--topics", JOINTS]) == 0
-    frames = read_frames(tmp_path / "set")
+    frames = export(tmp_path / "set", [bag, bag], "--marks", MARKS, "--topics", JOINTS)
     (path,) = (tmp_path / "set" / "meta" / "episodes").rglob("*.parquet")
     episodes = pyarrow.parquet.read_table(path).to_pylist()
     assert [one["tasks"] for one in episodes] == [["press"], ["slide"]] * 2
@@ -274,14 +269,14 @@ def test_marks_divide_a_bag_into_episodes(made, tmp_path, capsys):
     assert [one["dataset_to_index"] for one in episodes] == [21, 66, 87, 132]
     assert [one["data/file_index"] for one in episodes] == [0, 0, 1, 1]  # a file for each bag
     np.testing.assert_array_equal(frames["index"][:, 0], np.arange(132))
-    np.testing.assert_array_equal(
-        frames["task_index"][:, 0], np.repeat([0, 1, 0, 1], [21, 45, 21, 45])
-    )
+    lengths = [21, 45, 21, 45]
+    for name, numbers in (("task_index", [0, 1, 0, 1]), ("episode_index", range(4))):
+        np.testing.assert_array_equal(frames[name][:, 0], np.repeat(numbers, lengths))
     stamp_ns = table["stamp_ns"].to_numpy() - START_NS
     pressed = (stamp_ns >= 500_000_000) & (stamp_ns < 1_200_000_000)
     assert frames[f"{TACTILE}.count"][:21].sum() == pressed.sum()
     assert list(frames)[8:-5] == ["observation.state"]
-    number = np.concatenate([np.arange(length) for length in (21, 45, 21, 45)])
+    number = np.concatenate([np.arange(length) for length in lengths])
     np.testing.assert_array_equal(frames["frame_index"][:, 0], number)
     seconds = (number / FPS).astype(np.float32)
     np.testing.assert_array_equal(frames["timestamp"][:, 0], seconds)
@@ -294,9 +289,8 @@ def test_marks_divide_a_bag_into_episodes(made, tmp_path, capsys):
 def test_a_mark_ends_the_last_frame_of_its_episode(made, tmp_path):
     """0.7 s are 7.7 frames at 11 frames per second; the eighth has no sample after the mark."""
     bag, table, _ = made
-    command = ["export", "lerobot", str(bag), "-o", str(tmp_path / "set"), "--fps", "11"]
-    assert main([*command, "--marks", MARKS, "--topics"]) == 0
-    count = read_frames(tmp_path / "set")[f"{TACTILE}.count"]
+    frames = export(tmp_path / "set", [bag], "--marks", MARKS, "--topics", fps=11)
+    count = frames[f"{TACTILE}.count"]
     stamp_ns = table["stamp_ns"].to_numpy() - START_NS
     pressed = (stamp_ns >= 500_000_000) & (stamp_ns < 1_200_000_000)
     assert count[7].any() and count[:8].sum() == pressed.sum()
@@ -304,9 +298,7 @@ def test_a_mark_ends_the_last_frame_of_its_episode(made, tmp_path):
 
 def test_a_topic_that_one_of_two_bags_lacks_is_unknown_there(made, tmp_path):
     bag, plain = made[0], made[0].with_name("plain")
-    command = ["export", "lerobot", str(plain), str(bag), "-o", str(tmp_path / "set")]
-    assert main([*command, "--fps", "30", "--topics", JOINTS, RAW]) == 0
-    frames = read_frames(tmp_path / "set")
+    frames = export(tmp_path / "set", [plain, bag], "--topics", JOINTS, RAW)
     state = frames["observation.state"]
     assert state.shape == (180, 3)
     assert np.isnan(state[:90]).all() and np.isfinite(state[100:]).all()
@@ -357,9 +349,7 @@ def test_an_image_of_grey_and_opacity_is_exported(made, tmp_path):
     at_ns = START_NS + 10**9
     shown = message(kind, header=header(at_ns), format="png", data=data)
     bag = with_others(made[0].with_name("plain"), tmp_path / "bag", [(JPEG, at_ns, shown)])
-    command = ["export", "lerobot", str(bag), "-o", str(tmp_path / "set")]
-    assert main([*command, "--fps", "30"]) == 0
-    images = read_frames(tmp_path / "set")["observation.images.camera.image.compressed"]
+    images = export(tmp_path / "set", [bag])["observation.images.camera.image.compressed"]
     first, last = (Image.open(io.BytesIO(images[k])) for k in (0, -1))
     assert first.mode == "LA" and not first.getbbox() and last.getpixel((0, 0)) == (200, 100)
 
@@ -400,12 +390,7 @@ def test_a_message_that_does_not_fit_the_skin_is_left_out(tmp_path):
     at_ns = START_NS + 200_000_001
     less = frequencies_of(99, at_ns, np.full((16, 7), 1e5))
     bag = with_others(plain, tmp_path / "bag", [("/frequencies", at_ns, less)])
-    frames = []
-    for path in (plain, bag):
-        out = tmp_path / f"{path.name}_set"
-        assert main(["export", "lerobot", str(path), "-o", str(out), "--fps", "30"]) == 0
-        frames.append(read_frames(out))
-    expected, found = frames
+    expected, found = (export(tmp_path / f"{path.name}_set", [path]) for path in (plain, bag))
     for name, values in expected.items():
         # The windows of the bag have room for what was counted. Each has at least 3 samples.
         newest = slice(-3, None) if values.ndim > 2 else slice(None)
@@ -413,17 +398,15 @@ def test_a_message_that_does_not_fit_the_skin_is_left_out(tmp_path):
 
 
 def test_a_clock_that_was_set_is_refused(tmp_path, capsys):
-    bag = make_bag(tmp_path / "bag", SKIN, 20)
-    with Bag(bag) as source:
-        entries = list(source.entries())
-    with BagWriter(tmp_path / "jumps") as writer:
-        for topic, kind in sorted({(one.topic, one.msgtype) for one in entries}):
-            writer.add_topic(topic, kind)
-        for number, one in enumerate(entries):
-            data = bytearray(one.data)
-            if one.topic == "/frequencies" and number > 40:
-                data[4:8] = (2_000_000_000).to_bytes(4, "little")
-            writer.write(one.topic, one.time_ns, bytes(data))
+
+    def jump(number: int, entry: Entry) -> bytes:
+        data = bytearray(entry.data)
+        if entry.topic == "/frequencies" and number > 40:
+            data[4:8] = (2_000_000_000).to_bytes(4, "little")
+        return bytes(data)
+
+    plain = make_bag(tmp_path / "bag", SKIN, 20)
+    with_others(plain, tmp_path / "jumps", [], jump)
     command = ["export", "lerobot", str(tmp_path / "jumps"), "-o", str(tmp_path / "out")]
     assert main([*command, "--fps", "30"]) == 1
     assert "a clock was set" in capsys.readouterr().err

@@ -9,9 +9,9 @@ import json
 import os
 import shutil
 import subprocess
-import threading
 from dataclasses import replace
 from pathlib import Path
+from queue import Queue
 
 import numpy as np
 import pyarrow.parquet
@@ -40,46 +40,22 @@ PERIOD_NS = 4_000_000
 class HeldSource:
     """A live source that yields what the test puts in: the rows of each `give` at once."""
 
-    is_live = True
-
     def __init__(self, skin: Skin) -> None:
         self.skin = skin
-        self._given: list[FrequencyRows] = []
-        self._changed = threading.Condition()
-        self._closed = False
+        self._given: Queue[FrequencyRows | None] = Queue()
 
     def give(self, rows: FrequencyRows) -> None:
         """Put rows in and wait until the consumer comes back for more."""
-        with self._changed:
-            self._given.append(rows)
-            self._changed.notify_all()
-            assert self._changed.wait_for(lambda: not self._given, 10)
-
-    def statistics(self) -> dict[str, object]:
-        return {}
+        self._given.put(rows)
+        self._given.join()
 
     def close(self) -> None:
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
+        self._given.put(None)
 
     def __iter__(self):
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._given or self._closed)
-                if not self._given:
-                    return
-                rows = self._given[0]
+        while (rows := self._given.get()) is not None:
             yield rows
-            with self._changed:
-                self._given.pop(0)
-                self._changed.notify_all()
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
+            self._given.task_done()
 
 
 def record(
