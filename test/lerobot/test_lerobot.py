@@ -78,10 +78,16 @@ def compressed(k: int, stamp_ns: int) -> object:
     return message(kind, header=header(stamp_ns), format="jpeg", data=jpeg(k))
 
 
+def polygon(stamp_ns: int) -> object:
+    points = [message("geometry_msgs/msg/Point32", x=1.0, y=2.0, z=3.0)]
+    shape = message("geometry_msgs/msg/Polygon", points=points)
+    return message("geometry_msgs/msg/PolygonStamped", header=header(stamp_ns), polygon=shape)
+
+
 def others() -> list[tuple[str, int, object]]:
     """Topic, when it was recorded, message: an arm at 50 Hz with a gripper on the same topic, a
-    camera at 20 Hz from 0.2 s on, three marks."""
-    found = []
+    camera at 20 Hz from 0.2 s on, three marks, and a list of variable length."""
+    found = [("/outline", START_NS, polygon(START_NS))]
     for k in range(150):
         at_ns = START_NS + 20_000_000 * k
         found.append((JOINTS, at_ns + 5000, joints(["a", "b"], [k, -k], at_ns)))
@@ -123,6 +129,7 @@ def export(folder: Path, bags: list[Path], *options: str, fps: int = FPS) -> dic
     """Every column of the data set of some bags, which is written to a folder."""
     command = ["export", "lerobot", *map(str, bags), "-o", str(folder), "--fps", str(fps)]
     assert main([*command, *options]) == 0
+    assert not list(folder.parent.glob(".partial*"))
     return read_frames(folder)
 
 
@@ -226,6 +233,10 @@ def test_metadata_says_what_the_numbers_mean(made):
     features = info["features"]
     assert features["observation.state"]["names"] == ["a.position", "b.position", "grip.position"]
     assert features["observation.images.camera.image_raw"]["shape"] == [6, 8, 3]
+    assert not any("outline" in name for name in features)
+    assert features["observation.topics.force"]["names"] == [
+        f"wrench.{quantity}.{axis}" for quantity in ("force", "torque") for axis in "xyz"
+    ]
     said = features[TACTILE]["info"]
     assert said["components"] == list(COMPONENTS) and said["units"] == ["Pa"] * 6 + ["Pa/m"] * 9
     assert [cube["name"] for cube in said["cubes"]] == list(skin.names)
@@ -267,6 +278,9 @@ def test_marks_divide_a_bag_into_episodes(made, tmp_path, capsys):
     assert [one["tasks"] for one in episodes] == [["press"], ["slide"]] * 2
     assert [one["length"] for one in episodes] == [21, 45] * 2  # 0.7 s and 1.5 s
     assert [one["dataset_to_index"] for one in episodes] == [21, 66, 87, 132]
+    assert [one["stats/index/min"] for one in episodes] == [[0], [21], [66], [87]]
+    info = json.loads((tmp_path / "set" / "meta" / "info.json").read_text())
+    assert len(info["features"][TACTILE]["info"]["calibrations"]) == 1
     assert [one["data/file_index"] for one in episodes] == [0, 0, 1, 1]  # a file for each bag
     np.testing.assert_array_equal(frames["index"][:, 0], np.arange(132))
     lengths = [21, 45, 21, 45]
