@@ -25,9 +25,15 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, settings
 
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.device.wire.protocol import Sample
+
+# Hypothesis measures the time of an example by the wall clock, which also counts the time in which
+# a busy machine runs other processes.
+settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("busy")
 
 # A shell that starts us in the background has SIGINT ignored, in all that we start too.
 signal.signal(signal.SIGINT, signal.default_int_handler)

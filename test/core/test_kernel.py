@@ -278,7 +278,7 @@ def test_c_and_numpy_agree_on_every_bit(kernel, skin):
     assert_same_bits(played(kernel, SKINS[skin], 1), expected)
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(list(SKINS)))
 def test_c_and_numpy_agree_on_random_rows(seed, skin):
     if run.native is None:

@@ -337,7 +337,7 @@ def test_a_file_is_held_to_the_limit_of_the_service(tmp_path, hertz):
         read_tare(tmp_path, 7, CALIBRATION)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(data=st.data())
 def test_damaged_files_are_our_errors(tmp_path_factory, data):
     folder = tmp_path_factory.mktemp("tare")

@@ -39,7 +39,7 @@ needs_the_module = pytest.mark.skipif(native.wire is None, reason="was not compi
 
 
 @needs_the_module
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.one_of(st.binary(max_size=600), st.lists(st.integers(0, 2)).map(bytes)))
 def test_cobs_is_the_same(data: bytes) -> None:
     """As the algorithm of the paper, there and back; and of bytes that are no code."""

@@ -209,7 +209,6 @@ pieces = st.one_of(
 )
 thorough = settings(
     max_examples=200,
-    deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 

@@ -346,7 +346,7 @@ def conserved(decoder: Decoder, data: bytes) -> bool:
     return sum(errors(decoder).values()) + decoder.counters.frames == count_runs(data)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.lists(st.binary(max_size=200), max_size=10))
 def test_fuzz_any_bytes(pieces: list[bytes]) -> None:
     decoder = Decoder()
@@ -357,7 +357,7 @@ def test_fuzz_any_bytes(pieces: list[bytes]) -> None:
     assert decoder.counters.bytes == len(data)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.data())
 def test_fuzz_damaged_stream(data: st.DataObject) -> None:
     """Flips, cuts and insertions: each touches at most the runs it hits; every other frame comes
@@ -385,7 +385,7 @@ def test_fuzz_damaged_stream(data: st.DataObject) -> None:
     assert decoder.counters.frames <= n_frames
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     st.integers(0, 40),
     st.integers(0, 30),

@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from conftest import sample_frame
@@ -159,7 +159,6 @@ def test_links_that_are_late_by_different_times_make_whole_scans():
     assert taken(scan) == [[21, 21]], "and then they are in step again"
 
 
-@settings(deadline=None)
 @given(st.lists(st.tuples(*[st.integers(0, 3)] * 2), max_size=30), st.sampled_from([None, 1, 4]))
 def test_each_sample_is_built_once_and_in_order(turns, max_scans):
     """However late the links are, and by whatever."""

@@ -89,7 +89,7 @@ def hub_frequency(tmp_path_factory: pytest.TempPathFactory):
     )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(
     hertz=st.integers(10_000, 4_000_000),
     phase=st.fractions(0, Fraction(999_999, 1_000_000)),

@@ -111,7 +111,7 @@ PIECES = st.one_of(
 )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(pieces=st.lists(PIECES, min_size=20, max_size=60), cut=st.integers(0, 500))
 def test_a_crowd_of_short_runs_is_what_they_are_one_by_one(pieces: list[bytes], cut: int) -> None:
     """Frames and counters, however noise and frames mix, and wherever the bytes are cut."""
@@ -125,7 +125,7 @@ def test_a_crowd_of_short_runs_is_what_they_are_one_by_one(pieces: list[bytes], 
     assert counts == others
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(data=st.data())
 @pytest.mark.parametrize("read", list(SHIPPED), ids=lambda read: read.__name__)
 def test_damaged_files_are_read_or_our_error(

@@ -186,7 +186,7 @@ def test_a_fault_that_is_none_is_told(text, words):
         assert word in str(error.value)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     st.recursive(
         st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
