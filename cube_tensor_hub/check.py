@@ -33,7 +33,7 @@ class Checked:
         """Return the number of rules with an outcome: passed, failed or not tried."""
         return sum(result.outcome is outcome for result in self.results.values())
 
-    def failed(self) -> list[str]:
+    def list_failed(self) -> list[str]:
         """Return the numbers of the rules that the hub broke."""
         return [
             number for number, result in self.results.items() if result.outcome is Outcome.FAILED

@@ -182,7 +182,7 @@ class Conversation:
             self._ask("hello", Command.HELLO)
             if self._n_frames:
                 self._send_requests()
-                self._samples()
+                self._test_sampling()
                 self._stop_reading()
                 self._leave_as_found()
         except LinkError as error:
@@ -223,7 +223,7 @@ class Conversation:
         # A hub with flow control would stay silent for the rest of the check without an XON.
         self._send_bytes("XON", XON, Command.STOP)
 
-    def _samples(self) -> None:
+    def _test_sampling(self) -> None:
         """Start the hub, start it again, change its sample period, and stop it."""
         self._ask("impossible period", Request(Command.SET_PERIOD, 0))
         self._ask("after impossible period", Command.HELLO)
@@ -290,7 +290,7 @@ class Conversation:
         self._ask_time("before start")
         self._ask("start at once", Command.START)
         self._ask("last stop", Command.STOP)
-        hello = next(iter(self._transcript.frames(Hello)), None)
+        hello = next(iter(self._transcript.select_frames(Hello)), None)
         # 0 means that no host had set a period yet.
         if hello is not None and hello.period_us:
             self._ask("first period", Request(Command.SET_PERIOD, hello.period_us))
@@ -308,7 +308,9 @@ class Conversation:
         if requests:
             self._listen(
                 ANSWER_S,
-                lambda: step.n_answers >= len(requests) and len(step.frames(Hello)) >= hellos,
+                lambda: (
+                    step.n_answers >= len(requests) and len(step.select_frames(Hello)) >= hellos
+                ),
             )
         self._listen(seconds)
 
@@ -327,7 +329,7 @@ class Conversation:
         """Send bytes that a hub must ignore, and the valid request `last` behind them."""
         step = self._begin(name)
         self._wire.send(data + encode(Request(last)))
-        self._listen(ANSWER_S, lambda: step.ack(last) is not None)
+        self._listen(ANSWER_S, lambda: step.find_ack(last) is not None)
         self._listen(GRACE_S)
 
     def _begin(self, name: str, *requests: Request) -> CheckStep:

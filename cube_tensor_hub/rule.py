@@ -33,17 +33,17 @@ class RuleResult:
     text: str
 
 
-def passed(text: str) -> RuleResult:
+def report_passed(text: str) -> RuleResult:
     """Return the result for a rule that the hub keeps; `text` says what was measured."""
     return RuleResult(Outcome.PASSED, text)
 
 
-def failed(text: str) -> RuleResult:
+def report_failed(text: str) -> RuleResult:
     """Return the result for a rule that the hub breaks; `text` says what came instead."""
     return RuleResult(Outcome.FAILED, text)
 
 
-def not_tried(text: str) -> RuleResult:
+def report_not_tried(text: str) -> RuleResult:
     """Return the result for a rule that could not be checked; `text` says why."""
     return RuleResult(Outcome.NOT_TRIED, text)
 
@@ -76,9 +76,9 @@ class Rule:
     def check(self, transcript: Transcript) -> RuleResult:
         """Check the rule, if the frames that it needs came."""
         for kind in self.needs:
-            if not any(isinstance(heard.frame, kind) for heard in transcript.heard()):
+            if not any(isinstance(heard.frame, kind) for heard in transcript.iterate_heard()):
                 name = "frame" if kind is ANY_FRAME else kind.__name__.upper()
-                return not_tried(f"no {name} came")
+                return report_not_tried(f"no {name} came")
         return self.find_result(transcript)
 
 
@@ -116,7 +116,7 @@ def rule(
     return enter
 
 
-def never_tried(number: str, says: str, why: str) -> None:
+def enter_untried(number: str, says: str, why: str) -> None:
     """Enter a rule into `RULES` that cannot be checked in a conversation with a hub.
 
     Args:
@@ -124,4 +124,4 @@ def never_tried(number: str, says: str, why: str) -> None:
         says: Text of the rule on the page.
         why: Why it cannot be checked, as the check prints it.
     """
-    rule(number, says, needs=())(lambda transcript: not_tried(why))
+    rule(number, says, needs=())(lambda transcript: report_not_tried(why))

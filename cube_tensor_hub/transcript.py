@@ -61,21 +61,21 @@ class CheckStep:
     heard: list[Heard] = field(default_factory=list)
     damaged: int = 0
 
-    def frames(self, kind: type[FrameType]) -> list[FrameType]:
+    def select_frames(self, kind: type[FrameType]) -> list[FrameType]:
         """Return the frames of a kind, such as `Sample`, in the order of arrival."""
         return [heard.frame for heard in self.heard if isinstance(heard.frame, kind)]
 
     @property
     def acks(self) -> list[Ack]:
         """ACKs (answers to requests) that came in this step, in the order of arrival."""
-        return self.frames(Ack)
+        return self.select_frames(Ack)
 
     @property
     def n_answers(self) -> int:
         """Number of answers to requests: ACKs, and TIMEs, which answer the request for TIME."""
-        return len(self.acks) + len(self.frames(Time))
+        return len(self.acks) + len(self.select_frames(Time))
 
-    def ack(self, request: int) -> Ack | None:
+    def find_ack(self, request: int) -> Ack | None:
         """Return the first ACK (answer) to a request with this number; None: there is none."""
         return next((ack for ack in self.acks if ack.request == request), None)
 
@@ -101,19 +101,21 @@ class Transcript:
     damage: dict[str, int] = field(default_factory=dict)
     other_version: int | None = None
 
-    def heard(self, *names: str) -> Iterator[Heard]:
+    def iterate_heard(self, *names: str) -> Iterator[Heard]:
         """Yield all frames of the named steps, or of all steps."""
         for name, step in self.steps.items():
             if not names or name in names:
                 yield from step.heard
 
-    def frames(self, kind: type[FrameType], *names: str) -> list[FrameType]:
+    def select_frames(self, kind: type[FrameType], *names: str) -> list[FrameType]:
         """Return the frames of a kind in the named steps, or in all steps."""
-        return [heard.frame for heard in self.heard(*names) if isinstance(heard.frame, kind)]
+        return [
+            heard.frame for heard in self.iterate_heard(*names) if isinstance(heard.frame, kind)
+        ]
 
-    def ack(self, name: str, request: int) -> Ack | None:
+    def find_ack(self, name: str, request: int) -> Ack | None:
         """Return the first ACK to a request in the named step; None: there is none."""
-        return self.steps[name].ack(request)
+        return self.steps[name].find_ack(request)
 
     @property
     def first_visit(self) -> list[str]:
@@ -124,18 +126,18 @@ class Transcript:
         """
         return list(itertools.takewhile(lambda name: name != REOPENING_STEP, self.steps))
 
-    def visit(self, kind: type[FrameType]) -> list[FrameType]:
+    def select_visit_frames(self, kind: type[FrameType]) -> list[FrameType]:
         """Return the frames of a kind in the steps of `first_visit`."""
-        return self.frames(kind, *self.first_visit)
+        return self.select_frames(kind, *self.first_visit)
 
-    def visit_frames(self) -> Iterator[Frame]:
+    def iterate_visit_frames(self) -> Iterator[Frame]:
         """Yield all frames in the steps of `first_visit`."""
-        return (heard.frame for heard in self.heard(*self.first_visit))
+        return (heard.frame for heard in self.iterate_heard(*self.first_visit))
 
     @property
     def hello(self) -> Hello | None:
         """Last HELLO of the hub; None: none came."""
-        hellos = self.frames(Hello)
+        hellos = self.select_frames(Hello)
         return hellos[-1] if hellos else None
 
 

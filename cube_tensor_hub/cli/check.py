@@ -40,7 +40,7 @@ def run(options: argparse.Namespace) -> int:
     show_check(checked)
     if options.json is not None:
         write_json(options.json, checked.to_dict())
-    return 1 if checked.failed() else 0
+    return 1 if checked.list_failed() else 0
 
 
 def show_check(checked: Checked) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 from cube_tensor_driver.device.wire.protocol import Hello, Request, Sample
 
 from ..conversation import AFTER_DAMAGE, AFTER_WRONG_WAY, DAMAGED
-from ..rule import RuleResult, failed, not_tried, passed, rule
+from ..rule import RuleResult, report_failed, report_not_tried, report_passed, rule
 from ..transcript import Transcript
 
 OVERFULL = ("unread", "gone")
@@ -16,16 +16,18 @@ OVERFULL = ("unread", "gone")
 
 
 @rule("F1", "A sender puts a zero before and behind each frame.")
-def zeros_around(transcript: Transcript) -> RuleResult:
+def check_zeros_around_frames(transcript: Transcript) -> RuleResult:
     """Between two frames there must be two zeros: one behind the first, one before the second."""
     # Behind damaged bytes it is not known which zeros belong to the next frame (`opened` is None).
-    opened = [heard.opened for heard in transcript.heard() if heard.opened is not None]
+    opened = [heard.opened for heard in transcript.iterate_heard() if heard.opened is not None]
     if not opened:
-        return not_tried("no two frames came one behind the other")
+        return report_not_tried("no two frames came one behind the other")
     missing = opened.count(False)
     if missing:
-        return failed(f"{missing} of {len(opened)} frames have no zero of their own before them")
-    return passed(f"all of {len(opened)} frames")
+        return report_failed(
+            f"{missing} of {len(opened)} frames have no zero of their own before them"
+        )
+    return report_passed(f"all of {len(opened)} frames")
 
 
 @rule(
@@ -33,39 +35,41 @@ def zeros_around(transcript: Transcript) -> RuleResult:
     "A receiver counts each run that is no frame, as above, and continues with the next. It never "
     "answers it",
 )
-def goes_on_behind_damage(transcript: Transcript) -> RuleResult:
+def check_frames_behind_damage(transcript: Transcript) -> RuleResult:
     """Damaged requests must not be answered, and a valid request behind them must be."""
     step = transcript.steps["damaged"]
     answered = [DAMAGED[ack.request] for ack in step.acks if ack.request in DAMAGED]
     if answered:
-        return failed(f"the hub answered a request {answered[0]}")
-    if step.ack(AFTER_DAMAGE) is None:
-        return failed("no answer to a valid request behind noise and damaged requests")
-    return passed(f"no answer to noise and to a request {', '.join(DAMAGED.values())}")
+        return report_failed(f"the hub answered a request {answered[0]}")
+    if step.find_ack(AFTER_DAMAGE) is None:
+        return report_failed("no answer to a valid request behind noise and damaged requests")
+    return report_passed(f"no answer to noise and to a request {', '.join(DAMAGED.values())}")
 
 
 @rule("F3", "A frame that goes the wrong way, or that nobody waits for, is ignored.")
-def ignores_the_wrong_way(transcript: Transcript) -> RuleResult:
+def check_wrong_way_frames(transcript: Transcript) -> RuleResult:
     """Check that frames which only hubs send are not answered, and a request behind them is."""
     step = transcript.steps["wrong way"]
-    if step.ack(AFTER_WRONG_WAY) is None:
-        return failed("no answer to a request behind frames that only hubs send")
+    if step.find_ack(AFTER_WRONG_WAY) is None:
+        return report_failed("no answer to a request behind frames that only hubs send")
     if len(step.acks) > 1:
         others = [ack for ack in step.acks if ack.request != AFTER_WRONG_WAY]
-        return failed(f"the hub answered a frame that only hubs send: {(others or step.acks)[0]}")
-    return passed("HELLO, SAMPLE, STATS, TIME and ACK are not answered")
+        return report_failed(
+            f"the hub answered a frame that only hubs send: {(others or step.acks)[0]}"
+        )
+    return report_passed("HELLO, SAMPLE, STATS, TIME and ACK are not answered")
 
 
 @rule("F4", "Flags and spare bytes are sent as 0")
-def flags_are_0(transcript: Transcript) -> RuleResult:
+def check_flags(transcript: Transcript) -> RuleResult:
     """Check the bytes of HELLO and SAMPLE that version 1 of the protocol does not use."""
-    flags = [hello.flags for hello in transcript.frames(Hello) if hello.flags]
+    flags = [hello.flags for hello in transcript.select_frames(Hello) if hello.flags]
     if flags:
-        return failed(f"flags of HELLO are 0x{flags[0]:02x}")
-    spare = [sample.spare for sample in transcript.frames(Sample) if any(sample.spare)]
+        return report_failed(f"flags of HELLO are 0x{flags[0]:02x}")
+    spare = [sample.spare for sample in transcript.select_frames(Sample) if any(sample.spare)]
     if spare:
-        return failed(f"spare bytes of SAMPLE are {spare[0].hex(' ')}")
-    return passed("flags of HELLO and spare bytes of SAMPLE are 0")
+        return report_failed(f"spare bytes of SAMPLE are {spare[0].hex(' ')}")
+    return report_passed("flags of HELLO and spare bytes of SAMPLE are 0")
 
 
 @rule(
@@ -73,19 +77,19 @@ def flags_are_0(transcript: Transcript) -> RuleResult:
     "Each run of bytes between two zeros of a sender is a frame of this page that goes its way.",
     needs=(),
 )
-def nothing_but_frames(transcript: Transcript) -> RuleResult:
+def check_all_runs_are_frames(transcript: Transcript) -> RuleResult:
     """Every run of bytes must be a frame, and none a REQUEST, which only hosts send."""
     steps = [step for step in transcript.steps.values() if step.name not in OVERFULL]
     damaged = sum(step.damaged for step in steps)
     if damaged:
         kinds = ", ".join(f"{name} {count}" for name, count in transcript.damage.items())
         other = "" if transcript.other_version is None else f"; version {transcript.other_version}"
-        return failed(f"{damaged} runs of bytes are no frame ({kinds}{other})")
+        return report_failed(f"{damaged} runs of bytes are no frame ({kinds}{other})")
     # A REQUEST is a valid frame, but it goes from hosts to hubs only.
     wrong_way = [heard for step in steps for heard in step.heard if type(heard.frame) is Request]
     if wrong_way:
-        return failed(f"the hub sent {len(wrong_way)} frames of type REQUEST")
+        return report_failed(f"the hub sent {len(wrong_way)} frames of type REQUEST")
     frames = sum(len(step.heard) for step in steps)
     if not frames:
-        return not_tried("nothing came")
-    return passed(f"all of {frames} runs")
+        return report_not_tried("nothing came")
+    return report_passed(f"all of {frames} runs")

@@ -13,7 +13,7 @@ import numpy as np
 from cube_tensor_driver.core.layout import MAX_PADS
 from cube_tensor_driver.device.wire.protocol import Ack, Command, Hello, Sample, Stats
 
-from ..rule import RuleResult, failed, never_tried, not_tried, passed, rule
+from ..rule import RuleResult, enter_untried, report_failed, report_not_tried, report_passed, rule
 from ..transcript import CheckStep, Heard, Transcript
 
 MAX_BEHIND_ACK_S = 0.3
@@ -25,7 +25,7 @@ MAX_FIRST_HELLO_S = 0.9
 first of those that a hub sends once a second."""
 
 
-def once_a_second(transcript: Transcript, kind: type) -> str:
+def find_irregularity(transcript: Transcript, kind: type) -> str:
     """Return what is wrong with the times of frames of a kind, which must come once a second while
     the hub has stopped and while it has started; "" if nothing is."""
     for step, state in (("quiet", "stopped"), ("start", "started")):
@@ -43,16 +43,16 @@ def once_a_second(transcript: Transcript, kind: type) -> str:
 
 def count_frames_per_sample(transcript: Transcript) -> int:
     """Return the number of frames that most samples consist of."""
-    frames = Counter(sample.sequence for sample in transcript.frames(Sample))
+    frames = Counter(sample.sequence for sample in transcript.select_frames(Sample))
     return mode(frames.values())
 
 
 def select_kind(transcript: Transcript, kind: type, *names: str) -> list[Heard]:
     """Return the frames of a kind with their times, in the named steps."""
-    return [heard for heard in transcript.heard(*names) if isinstance(heard.frame, kind)]
+    return [heard for heard in transcript.iterate_heard(*names) if isinstance(heard.frame, kind)]
 
 
-def hello_is_behind_ack(step: CheckStep) -> bool:
+def is_hello_behind_ack(step: CheckStep) -> bool:
     """Return whether a HELLO came behind the ACK of request 1.
 
     A missing ACK is for R1 to report.
@@ -86,52 +86,54 @@ def is_late_after_power_up(transcript: Transcript) -> bool:
     "A hub sends HELLO after power-up, behind the ACK of request 1, and once a second.",
     needs=(),
 )
-def hello_comes(transcript: Transcript) -> RuleResult:
+def check_hello_times(transcript: Transcript) -> RuleResult:
     """Check the HELLOs (descriptions of the hub) at power-up, on request, and once a second."""
     if not transcript.first_bytes and not transcript.is_tcp:
-        return not_tried("nothing came: see L2")
-    if not any(transcript.heard()):
-        return failed("no HELLO came, and no other frame")
-    if not all(map(hello_is_behind_ack, transcript.steps.values())):
-        return failed(f"no HELLO within {MAX_BEHIND_ACK_S:g} s behind the ACK of request 1")
+        return report_not_tried("nothing came: see L2")
+    if not any(transcript.iterate_heard()):
+        return report_failed("no HELLO came, and no other frame")
+    if not all(map(is_hello_behind_ack, transcript.steps.values())):
+        return report_failed(f"no HELLO within {MAX_BEHIND_ACK_S:g} s behind the ACK of request 1")
     if is_late_after_power_up(transcript):
-        return failed(f"no HELLO in the first {MAX_FIRST_HELLO_S:g} s after power-up")
-    wrong = once_a_second(transcript, Hello)
+        return report_failed(f"no HELLO in the first {MAX_FIRST_HELLO_S:g} s after power-up")
+    wrong = find_irregularity(transcript, Hello)
     if wrong:
-        return failed(wrong)
-    return passed("behind the ACK of request 1, and once a second, stopped and started")
+        return report_failed(wrong)
+    return report_passed("behind the ACK of request 1, and once a second, stopped and started")
 
 
 @rule("H2", "All other uids of a hub differ", needs=(Hello,))
-def uids_differ(transcript: Transcript) -> RuleResult:
+def check_uids(transcript: Transcript) -> RuleResult:
     """Check that the uids (unique numbers) of hub and cubes are unique and stay the same."""
-    hellos = transcript.frames(Hello)
+    hellos = transcript.select_frames(Hello)
     hubs = list(dict.fromkeys(hello.hub_uid for hello in hellos))
     if len(hubs) > 1:
-        return failed(f"the hub's uid changed from 0x{hubs[0]:x} to 0x{hubs[1]:x}")
+        return report_failed(f"the hub's uid changed from 0x{hubs[0]:x} to 0x{hubs[1]:x}")
     for one, other in pairwise(hellos):
         # Nobody exchanges cubes during a check; a hub may find more of them after power-up.
         same_number = one.n_cubes == other.n_cubes
         if same_number and one.cube_uids.tolist() != other.cube_uids.tolist():
-            return failed("the uids of the cubes, or their order, changed between two HELLOs")
+            return report_failed(
+                "the uids of the cubes, or their order, changed between two HELLOs"
+            )
     uids = Counter(hellos[-1].cube_uids.tolist())
     # A uid of 0 means that the cube has none.
     without = uids.pop(0, 0)
     for uid, number in uids.items():
         if number > 1:
             cubes = np.flatnonzero(hellos[-1].cube_uids == uid)
-            return failed(f"cubes {' and '.join(map(str, cubes))} both have uid 0x{uid:x}")
+            return report_failed(f"cubes {' and '.join(map(str, cubes))} both have uid 0x{uid:x}")
     text = f"hub 0x{hubs[0]:x}, {len(uids)} cubes with different uids"
-    return passed(text + (f", {without} without one" if without else ""))
+    return report_passed(text + (f", {without} without one" if without else ""))
 
 
 @rule("H3", "A hub has 1 to 32 pads per cube", needs=(Hello,))
-def pads_fit_the_mask(transcript: Transcript) -> RuleResult:
+def check_number_of_pads(transcript: Transcript) -> RuleResult:
     """Check the number of pads in each HELLO; the mask of pad faults has 32 bits."""
-    for hello in transcript.frames(Hello):
+    for hello in transcript.select_frames(Hello):
         if hello.n_cubes and not 1 <= hello.n_pads <= MAX_PADS:
-            return failed(f"HELLO says {hello.n_pads} pads per cube")
-    return passed(f"{hello.n_cubes} cubes of {hello.n_pads} pads")
+            return report_failed(f"HELLO says {hello.n_pads} pads per cube")
+    return report_passed(f"{hello.n_cubes} cubes of {hello.n_pads} pads")
 
 
 @rule(
@@ -140,14 +142,14 @@ def pads_fit_the_mask(transcript: Transcript) -> RuleResult:
     "behind it.",
     needs=(Hello, Sample),
 )
-def cubes_stay(transcript: Transcript) -> RuleResult:
+def check_cubes_stay(transcript: Transcript) -> RuleResult:
     """The number of cubes in SAMPLE may change only behind a HELLO with another number.
 
     Whether it is the number of HELLO is for S5 to check.
     """
     frames = count_frames_per_sample(transcript)
     hello, last = 0, None
-    for frame in transcript.visit_frames():
+    for frame in transcript.iterate_visit_frames():
         if isinstance(frame, Hello):
             # From here on another number of cubes is right.
             if frame.n_cubes != hello:
@@ -155,14 +157,14 @@ def cubes_stay(transcript: Transcript) -> RuleResult:
         # A frame of a split sample does not have all cubes.
         elif isinstance(frame, Sample) and frames == 1:
             if last not in (None, frame.n_cubes):
-                return failed(
+                return report_failed(
                     f"samples had {last} cubes, then {frame.n_cubes}, and no HELLO said so"
                 )
             last = frame.n_cubes
-    return passed("the cubes of the samples are the same from HELLO to HELLO")
+    return report_passed("the cubes of the samples are the same from HELLO to HELLO")
 
 
-never_tried(
+enter_untried(
     "H5",
     "The pads of a cube are in the order of its layout",
     "bytes do not show it: press on one pad after the other, docs/build.md",

@@ -7,10 +7,10 @@ from __future__ import annotations
 from cube_tensor_driver.device.wire.protocol import Command, Hello, Sample, Stats
 
 from ..conversation import AWAY_S, SECOND_S
-from ..rule import RuleResult, failed, never_tried, not_tried, passed, rule
+from ..rule import RuleResult, enter_untried, report_failed, report_not_tried, report_passed, rule
 from ..transcript import Transcript
-from .request import behind_ack
-from .sample import forward, sample_rate
+from .request import select_behind_ack
+from .sample import compute_increase, compute_sample_rate
 
 TELNET_COMMANDS = range(0xFB, 0xFF)
 """Second byte of a Telnet negotiation: WILL, WON'T, DO, DON'T (RFC 854)."""
@@ -24,41 +24,41 @@ this time. Below it, the hub has stopped sampling."""
 
 
 @rule("L1", "no flow control, neither RTS/CTS nor XON/XOFF")
-def no_flow_control(transcript: Transcript) -> RuleResult:
+def check_no_flow_control(transcript: Transcript) -> RuleResult:
     """A hub with XON/XOFF would stop sending behind an XOFF byte."""
-    if transcript.ack("XOFF", Command.STOP) is None:
-        return failed("the hub did not answer behind an XOFF byte (0x13)")
-    return passed("an XOFF byte (0x13) does not stop the hub")
+    if transcript.find_ack("XOFF", Command.STOP) is None:
+        return report_failed("the hub did not answer behind an XOFF byte (0x13)")
+    return report_passed("an XOFF byte (0x13) does not stop the hub")
 
 
 @rule("L2", "must send while DTR is set", needs=())
-def sends_while_dtr_is_set(transcript: Transcript) -> RuleResult:
+def check_sends_with_dtr(transcript: Transcript) -> RuleResult:
     """Check that anything comes from a serial port, whose DTR line the check has set."""
     if transcript.is_tcp:
-        return not_tried("TCP has no DTR")
+        return report_not_tried("TCP has no DTR")
     if not transcript.first_bytes:
         seconds = sum(step.end_s - step.sent_s for step in transcript.steps.values())
-        return failed(f"not one byte in {seconds:.1f} s, with DTR and RTS set")
-    return passed("the hub sends with DTR and RTS set")
+        return report_failed(f"not one byte in {seconds:.1f} s, with DTR and RTS set")
+    return report_passed("the hub sends with DTR and RTS set")
 
 
 @rule("L3", "The bytes are those of a serial port and nothing else: no Telnet, no TLS.", needs=())
-def nothing_but_the_bytes(transcript: Transcript) -> RuleResult:
+def check_no_telnet_or_tls(transcript: Transcript) -> RuleResult:
     """Check that a TCP connection does not begin with bytes of Telnet or TLS."""
     if not transcript.is_tcp:
-        return not_tried("this is no TCP link")
+        return report_not_tried("this is no TCP link")
     first = transcript.first_bytes
     # 0xFF begins a command of Telnet.
     if len(first) > 1 and first[0] == 0xFF and first[1] in TELNET_COMMANDS:
-        return failed(f"the bridge begins with a command of Telnet: {first[:3].hex(' ')}")
+        return report_failed(f"the bridge begins with a command of Telnet: {first[:3].hex(' ')}")
     if first[:2] == TLS_RECORD:
-        return failed(f"the bridge begins with a record of TLS: {first[:3].hex(' ')}")
+        return report_failed(f"the bridge begins with a record of TLS: {first[:3].hex(' ')}")
     if not first:
-        return not_tried("nothing came")
-    return passed("neither Telnet nor TLS at the beginning")
+        return report_not_tried("nothing came")
+    return report_passed("neither Telnet nor TLS at the beginning")
 
 
-never_tried(
+enter_untried(
     "L4",
     "A connection that ends or fails is lost.",
     "a rule of the host",
@@ -71,40 +71,44 @@ never_tried(
     "it would have answered the last one.",
     needs=(Hello, Sample, Stats),
 )
-def host_goes_away(transcript: Transcript) -> RuleResult:
+def check_closed_port(transcript: Transcript) -> RuleResult:
     """The counters of STATS around the time in which the port was closed must have gone on."""
-    before = transcript.visit(Stats)[-1]
-    earlier = transcript.visit(Hello)
-    after = transcript.frames(Stats, "back")
-    hellos = transcript.frames(Hello, "back")
+    before = transcript.select_visit_frames(Stats)[-1]
+    earlier = transcript.select_visit_frames(Hello)
+    after = transcript.select_frames(Stats, "back")
+    hellos = transcript.select_frames(Hello, "back")
     if not hellos:
-        return failed(f"no HELLO after the port was closed for {AWAY_S:g} s and opened again")
+        return report_failed(
+            f"no HELLO after the port was closed for {AWAY_S:g} s and opened again"
+        )
     if not after:
-        return failed("no STATS after the port was closed and opened again")
+        return report_failed("no STATS after the port was closed and opened again")
     # The uptime went back, so the hub has restarted; only a serial port may cause that.
     if after[-1].uptime_ms < before.uptime_ms:
         if transcript.is_tcp:
-            return failed("the hub restarted when the connection was closed and made again")
-        return not_tried("this hub restarts when its port is opened, as L2 allows")
+            return report_failed("the hub restarted when the connection was closed and made again")
+        return report_not_tried("this hub restarts when its port is opened, as L2 allows")
     if earlier and earlier[-1].period_us != hellos[-1].period_us:
-        return failed(f"HELLO said {earlier[-1].period_us} µs, now {hellos[-1].period_us} µs")
-    if transcript.frames(Sample, "back while stopped"):
-        return failed("samples came after a stopped hub's port was closed and opened again")
-    taken = forward(after[-1].taken, before.taken)
+        return report_failed(
+            f"HELLO said {earlier[-1].period_us} µs, now {hellos[-1].period_us} µs"
+        )
+    if transcript.select_frames(Sample, "back while stopped"):
+        return report_failed("samples came after a stopped hub's port was closed and opened again")
+    taken = compute_increase(after[-1].taken, before.taken)
     if taken < 0:
-        return failed(
+        return report_failed(
             f"{before.taken} samples taken before the port was closed, {after[-1].taken}"
             " after it was opened again"
         )
     seconds = 1e-3 * (after[-1].uptime_ms - before.uptime_ms)
     # Samples that a busy host reads before the ACK were taken at the faster period.
-    samples = behind_ack(transcript.steps["period again"], Command.SET_PERIOD)
-    rate = sample_rate(samples[1:])
+    samples = select_behind_ack(transcript.steps["period again"], Command.SET_PERIOD)
+    rate = compute_sample_rate(samples[1:])
     if taken < MIN_TAKEN_SHARE * seconds * rate:
-        return failed(
+        return report_failed(
             f"{taken} samples taken in the {seconds:.2f} s in which the port was closed and opened "
             f"again, {seconds * rate:.0f} were due"
         )
-    if rate and not behind_ack(transcript.steps["back"], Command.HELLO):
-        return failed(f"no sample came in {SECOND_S:g} s after the port was opened again")
-    return passed(f"{taken} samples taken in {seconds:.2f} s around a port that was closed")
+    if rate and not select_behind_ack(transcript.steps["back"], Command.HELLO):
+        return report_failed(f"no sample came in {SECOND_S:g} s after the port was opened again")
+    return report_passed(f"{taken} samples taken in {seconds:.2f} s around a port that was closed")

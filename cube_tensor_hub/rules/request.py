@@ -10,7 +10,7 @@ from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.device.wire.protocol import Ack, Command, Hello, Result, Sample, Stats
 
 from ..conversation import PERIOD_US, UNKNOWN
-from ..rule import RuleResult, failed, never_tried, not_tried, passed, rule
+from ..rule import RuleResult, enter_untried, report_failed, report_not_tried, report_passed, rule
 from ..transcript import CheckStep, Transcript
 from .sample import compute_periods_us, find_first_frames
 
@@ -26,13 +26,13 @@ MIN_PERIODS = 3
 """Smallest number of measured sample periods from which a rule draws a conclusion."""
 
 
-def in_force(step: CheckStep) -> int:
+def find_period_in_force(step: CheckStep) -> int:
     """Return the sample period in the ACK of SET_PERIOD in a step, in µs; 0: there was no ACK."""
-    ack = step.ack(Command.SET_PERIOD)
+    ack = step.find_ack(Command.SET_PERIOD)
     return 0 if ack is None else ack.argument
 
 
-def behind_ack(step: CheckStep, request: int) -> list[Sample]:
+def select_behind_ack(step: CheckStep, request: int) -> list[Sample]:
     """Return the samples of a step that came behind the first ACK (answer) to a request."""
     frames = [heard.frame for heard in step.heard]
     for at, frame in enumerate(frames):
@@ -42,7 +42,7 @@ def behind_ack(step: CheckStep, request: int) -> list[Sample]:
 
 
 @rule("R1", "Each valid request gets one ACK, in order, after it was carried out")
-def one_ack_each(transcript: Transcript) -> RuleResult:
+def check_acks(transcript: Transcript) -> RuleResult:
     """In each step the ACKs must be those of the requests, in order.
 
     That a request was carried out before its ACK shows in the samples around START and STOP.
@@ -56,20 +56,20 @@ def one_ack_each(transcript: Transcript) -> RuleResult:
         n_requests += len(asked)
         answered = [ack.request for ack in step.acks]
         if answered != asked:
-            return failed(
-                f"requests {words(asked)} got ACKs {words(answered)}, in the step '{step.name}'"
+            return report_failed(
+                f"requests {format_numbers(asked)} got ACKs {format_numbers(answered)}, in the step '{step.name}'"
             )
     # A STOP that was carried out before its ACK leaves no sample behind it.
     for name in ("stop", "stop samples"):
-        late = behind_ack(transcript.steps[name], Command.STOP)
+        late = select_behind_ack(transcript.steps[name], Command.STOP)
         if late:
-            return failed(f"{len(late)} samples came behind the ACK of STOP")
-    if not transcript.frames(Sample, "start"):
-        return failed("no SAMPLE came behind the ACK of START")
-    return passed(f"{n_requests} requests, one ACK each, in order")
+            return report_failed(f"{len(late)} samples came behind the ACK of STOP")
+    if not transcript.select_frames(Sample, "start"):
+        return report_failed("no SAMPLE came behind the ACK of START")
+    return report_passed(f"{n_requests} requests, one ACK each, in order")
 
 
-def words(numbers: list[int]) -> str:
+def format_numbers(numbers: list[int]) -> str:
     """Return numbers as text for a sentence, such as "1, 3", or "none"."""
     return ", ".join(map(str, numbers)) or "none"
 
@@ -80,19 +80,19 @@ def words(numbers: list[int]) -> str:
     "0, as is that of request 5 and of unknown requests.",
     needs=(Ack,),
 )
-def arguments_that_are_0(transcript: Transcript) -> RuleResult:
+def check_zero_arguments(transcript: Transcript) -> RuleResult:
     """Check argument and result of the ACKs (answers) of all requests but SET_PERIOD."""
-    acks = [ack for ack in transcript.frames(Ack) if ack.request != Command.SET_PERIOD]
+    acks = [ack for ack in transcript.select_frames(Ack) if ack.request != Command.SET_PERIOD]
     for ack in acks:
         if ack.argument:
-            return failed(f"the ACK of request {ack.request} has argument {ack.argument}")
+            return report_failed(f"the ACK of request {ack.request} has argument {ack.argument}")
         # The result of a second START or STOP is for R6 to check.
         if ack.request in (Command.HELLO, Command.IDENTIFY) and ack.result != Result.DONE:
-            return failed(f"request {ack.request} was answered with result {ack.result}")
-    unknown = transcript.ack("unknown request", UNKNOWN)
+            return report_failed(f"request {ack.request} was answered with result {ack.result}")
+    unknown = transcript.find_ack("unknown request", UNKNOWN)
     if unknown is not None and unknown.result != Result.UNKNOWN:
-        return failed(f"unknown request {UNKNOWN} was answered with result {unknown.result}")
-    return passed(f"in {len(acks)} ACKs; the arguments of requests are ignored")
+        return report_failed(f"unknown request {UNKNOWN} was answered with result {unknown.result}")
+    return report_passed(f"in {len(acks)} ACKs; the arguments of requests are ignored")
 
 
 @rule(
@@ -100,25 +100,25 @@ def arguments_that_are_0(transcript: Transcript) -> RuleResult:
     "It answers 0 (done) with the period now in force, which HELLO then says too.",
     needs=(Ack, Hello),
 )
-def period_is_kept(transcript: Transcript) -> RuleResult:
+def check_period_is_kept(transcript: Transcript) -> RuleResult:
     """Check that ACK, HELLO and samples agree on the sample period."""
-    ack = transcript.ack("period", Command.SET_PERIOD)
+    ack = transcript.find_ack("period", Command.SET_PERIOD)
     if ack is None or ack.result == Result.REFUSED:
-        return not_tried(f"the hub did not take a period of {PERIOD_US} µs")
+        return report_not_tried(f"the hub did not take a period of {PERIOD_US} µs")
     if ack.result != Result.DONE:
-        return failed(f"request 4 was answered with result {ack.result}")
+        return report_failed(f"request 4 was answered with result {ack.result}")
     wrong = _find_other_period(transcript)
     if wrong:
-        return failed(wrong)
-    gaps = compute_periods_us(transcript.frames(Sample, "start"))
+        return report_failed(wrong)
+    gaps = compute_periods_us(transcript.select_frames(Sample, "start"))
     if len(gaps) < MIN_PERIODS:
-        return not_tried(f"{len(gaps)} periods came in the step 'start', 3 are needed")
+        return report_not_tried(f"{len(gaps)} periods came in the step 'start', 3 are needed")
     middle = float(np.median(gaps))
     text = f"asked {PERIOD_US} µs, in force {ack.argument} µs, median {middle:.1f} µs"
     # Both times of a period are rounded to 1 µs, the resolution of device time: hence the 2 µs.
     if abs(middle - ack.argument) > PERIOD_TOLERANCE * ack.argument + 2:
-        return failed(text)
-    return passed(f"{text}, mean {gaps.mean():.1f} µs, jitter {gaps.std():.1f} µs")
+        return report_failed(text)
+    return report_passed(f"{text}, mean {gaps.mean():.1f} µs, jitter {gaps.std():.1f} µs")
 
 
 def _find_other_period(transcript: Transcript) -> str:
@@ -144,35 +144,37 @@ def _find_other_period(transcript: Transcript) -> str:
     "A hub that cannot do a period answers 2 (refused) with the one in force, and keeps that.",
     needs=(Ack, Hello),
 )
-def impossible_period(transcript: Transcript) -> RuleResult:
+def check_impossible_period(transcript: Transcript) -> RuleResult:
     """Check that a sample period of 0 changes nothing, whether the hub has started or not."""
-    ack = transcript.ack("impossible period", Command.SET_PERIOD)
+    ack = transcript.find_ack("impossible period", Command.SET_PERIOD)
     if ack is None:
-        return not_tried("request 4 was not answered: see R1")
+        return report_not_tried("request 4 was not answered: see R1")
     # The last HELLO before the request tells the period that was in force.
-    before = transcript.frames(Hello, "three at once")
-    after = transcript.frames(Hello, "after impossible period")
+    before = transcript.select_frames(Hello, "three at once")
+    after = transcript.select_frames(Hello, "after impossible period")
     if after and after[0].period_us != ack.argument:
-        return failed(
+        return report_failed(
             f"0 µs was answered with {ack.argument} µs, HELLO says {after[0].period_us} µs now"
         )
     started = transcript.steps["refused while started"]
-    was_sampling = transcript.frames(Sample, "start again 2")
-    if was_sampling and started.acks and len(behind_ack(started, Command.SET_PERIOD)) < 2:
-        return failed("no samples came any more after a period of 0 µs")
+    was_sampling = transcript.select_frames(Sample, "start again 2")
+    if was_sampling and started.acks and len(select_behind_ack(started, Command.SET_PERIOD)) < 2:
+        return report_failed("no samples came any more after a period of 0 µs")
     # A hub may round any period to one that it can do.
     if ack.result == Result.DONE and ack.argument:
-        return not_tried(f"the hub rounded a period of 0 µs to {ack.argument} µs, as R3 allows")
+        return report_not_tried(
+            f"the hub rounded a period of 0 µs to {ack.argument} µs, as R3 allows"
+        )
     if ack.result != Result.REFUSED:
-        return failed(f"a period of 0 µs was answered with result {ack.result}")
+        return report_failed(f"a period of 0 µs was answered with result {ack.result}")
     if before and ack.argument != before[-1].period_us:
-        return failed(
+        return report_failed(
             f"refused with {ack.argument} µs, where {before[-1].period_us} µs were in force"
         )
-    return passed(f"0 µs is refused, {ack.argument} µs stay in force")
+    return report_passed(f"0 µs is refused, {ack.argument} µs stay in force")
 
 
-never_tried(
+enter_untried(
     "R5",
     "A HELLO with a period that is neither the one asked for",
     "a rule of the host",
@@ -185,83 +187,85 @@ never_tried(
     "has stopped.",
     needs=(Ack,),
 )
-def start_and_stop_again(transcript: Transcript) -> RuleResult:
+def check_repeated_start_and_stop(transcript: Transcript) -> RuleResult:
     """Check that a second START or STOP is answered 0 (done) and moves no sample."""
     # START is sent three times, at different places within a period.
     again = [name for name in transcript.steps if name.startswith("start again")]
     asked = [(Command.START, name) for name in again]
     asked += [(Command.STOP, name) for name in ("three at once", "stop again")]
     for command, name in asked:
-        ack = transcript.ack(name, command)
+        ack = transcript.find_ack(name, command)
         if ack is not None and ack.result != Result.DONE:
-            return failed(f"a second {command.name} was answered with result {ack.result}")
-    period_us = in_force(transcript.steps["period"])
+            return report_failed(f"a second {command.name} was answered with result {ack.result}")
+    period_us = find_period_in_force(transcript.steps["period"])
     # The last samples before the second START; earlier ones may have drifted.
-    before = phases(transcript.frames(Sample, "start"), period_us)[-5:]
+    before = compute_phases(transcript.select_frames(Sample, "start"), period_us)[-5:]
     if len(before) < 3:
-        return not_tried("too few samples came to see it")
+        return report_not_tried("too few samples came to see it")
     for name in again:
-        behind = phases(transcript.frames(Sample, name), period_us)
+        behind = compute_phases(transcript.select_frames(Sample, name), period_us)
         if len(behind) < 3:
-            return failed(f"{len(behind)} samples came after a second START")
+            return report_failed(f"{len(behind)} samples came after a second START")
         # A busy emulator is late for some samples, so those nearest to each other are compared.
         apart = (behind[:, None] - before + 0.5) % 1.0 - 0.5
         shift = float(np.abs(apart).min())
         if shift > MAX_SHIFT:
-            return failed(f"a second START moved the samples by {shift:.2f} periods")
+            return report_failed(f"a second START moved the samples by {shift:.2f} periods")
         before = behind
-    return passed("a second START moves no sample; both are answered 0")
+    return report_passed("a second START moves no sample; both are answered 0")
 
 
-def phases(samples: list[Sample], period_us: int) -> Array:
+def compute_phases(samples: list[Sample], period_us: int) -> Array:
     """Return the phase (0 to 1) of the device time of each sample within the sample period."""
     times = [sample.device_us for sample in find_first_frames(samples)]
     return np.array(times) % max(1, period_us) / max(1, period_us)
 
 
 @rule("R7", "A new period counts at once, also while samples flow.", needs=(Sample, Ack))
-def new_period_at_once(transcript: Transcript) -> RuleResult:
+def check_new_period(transcript: Transcript) -> RuleResult:
     """Check the times of the samples behind the ACK of a new sample period."""
-    period_us = in_force(transcript.steps["slower"])
-    if not period_us or period_us == in_force(transcript.steps["period"]):
-        return not_tried("the hub did not take another period")
+    period_us = find_period_in_force(transcript.steps["slower"])
+    if not period_us or period_us == find_period_in_force(transcript.steps["period"]):
+        return report_not_tried("the hub did not take another period")
     # The first gap behind the ACK may still have begun with the old period.
-    gaps = compute_periods_us(behind_ack(transcript.steps["slower"], Command.SET_PERIOD))[1:]
+    gaps = compute_periods_us(select_behind_ack(transcript.steps["slower"], Command.SET_PERIOD))[1:]
     if len(gaps) < MIN_PERIODS:
-        return failed(f"{len(gaps) + 1} periods came after a new period of {period_us} µs")
+        return report_failed(f"{len(gaps) + 1} periods came after a new period of {period_us} µs")
     # There are few gaps, so the limit is wide; R3 checks the period closely.
     middle = float(np.median(gaps))
     if abs(middle - period_us) > MAX_SHIFT * period_us:
-        return failed(f"{period_us} µs in force, but samples come every {middle:.0f} µs")
-    return passed(f"{middle:.0f} µs from the next sample on")
+        return report_failed(f"{period_us} µs in force, but samples come every {middle:.0f} µs")
+    return report_passed(f"{middle:.0f} µs from the next sample on")
 
 
 @rule("R8", "After power-up a hub has stopped, until START.")
-def stopped_until_start(transcript: Transcript) -> RuleResult:
+def check_stopped_until_start(transcript: Transcript) -> RuleResult:
     """Check that a hub that was switched on, or restarted, during the check sends no samples.
 
     If it was switched on before the check, samples may be those of an earlier START.
     """
-    restarted = transcript.frames(Stats, "back")
-    visit = transcript.visit(Stats)
+    restarted = transcript.select_frames(Stats, "back")
+    visit = transcript.select_visit_frames(Stats)
     if restarted and visit and restarted[-1].uptime_ms < visit[-1].uptime_ms:
         # Opening the port has restarted this hub, and no START was sent after that. Samples from
         # before the restart may still be on the way until it answers.
-        n = len(behind_ack(transcript.steps["back"], Command.HELLO))
+        n = len(select_behind_ack(transcript.steps["back"], Command.HELLO))
         text = f"{n} samples came behind a restart when the port was opened"
-        return failed(text) if n else passed(text)
-    early = transcript.frames(Sample, "opened", "hello")
-    stats = transcript.frames(Stats, "opened", "hello", "quiet")
+        return report_failed(text) if n else report_passed(text)
+    early = transcript.select_frames(Sample, "opened", "hello")
+    stats = transcript.select_frames(Stats, "opened", "hello", "quiet")
     if not stats:
-        return not_tried("no STATS came, so when the power came on is not known")
+        return report_not_tried("no STATS came, so when the power came on is not known")
     opened = transcript.steps["opened"].sent_s
-    first = next(heard for heard in transcript.heard() if isinstance(heard.frame, Stats))
+    first = next(heard for heard in transcript.iterate_heard() if isinstance(heard.frame, Stats))
     # If the power came on before the port was opened, samples may be those of an earlier START.
     uptime_s = 1e-3 * stats[0].uptime_ms
     if early and uptime_s < first.at_s - opened + 0.5:
-        return failed(f"{len(early)} samples came before START, {uptime_s:.1f} s after power-up")
+        return report_failed(
+            f"{len(early)} samples came before START, {uptime_s:.1f} s after power-up"
+        )
     if stats[0].taken == 0 and not early:
-        return passed(f"no sample in the first {uptime_s:.1f} s since power-up")
-    return not_tried(
+        return report_passed(f"no sample in the first {uptime_s:.1f} s since power-up")
+    return report_not_tried(
         f"the power came on {uptime_s:.0f} s ago: switch the hub off and on, and check"
     )

@@ -57,18 +57,18 @@ def made(kind: type[HubInMemory], settings: dict[str, object]) -> HubInMemory:
 def test_a_faulty_hub_fails_exactly_the_rules_that_it_breaks(what, kind):
     rules, _ = what.split(": ", 1)
     result = checked(made(kind, {}), is_tcp=hasattr(kind, "only_tcp"))
-    assert result.failed() == rules.split(), result.to_dict()
+    assert result.list_failed() == rules.split(), result.to_dict()
 
 
 @pytest.mark.parametrize(("number", "settings"), WRONG_SETTINGS.items())
 def test_a_hub_with_wrong_settings_fails_exactly_one_rule(number, settings):
-    assert checked(made(HubInMemory, settings)).failed() == [number]
+    assert checked(made(HubInMemory, settings)).list_failed() == [number]
 
 
 @pytest.mark.parametrize("greeting", [b"\xff\xfb\x01", b"\x15\x03\x01"], ids=["Telnet", "TLS"])
 def test_a_bridge_that_speaks_something_else_fails_l3(greeting):
     result = checked(made(HubInMemory, {}), is_tcp=True, greeting=greeting)
-    assert result.failed() == ["L3"]
+    assert result.list_failed() == ["L3"]
 
 
 class Restarts(HubInMemory):
@@ -182,12 +182,12 @@ def test_a_sound_hub_passes(kind, settings, is_tcp):
     if is_tcp and kind is Restarts:
         pytest.skip("with TCP it may not restart")
     result = checked(made(kind, settings), is_tcp=is_tcp)
-    assert not result.failed(), result.to_dict()
+    assert not result.list_failed(), result.to_dict()
 
 
 def test_a_sound_hub_passes_on_a_slow_line():
     result = check(SlowWire(made(HubInMemory, {})))
-    assert not result.failed(), result.to_dict()
+    assert not result.list_failed(), result.to_dict()
 
 
 class BusyHost(MemoryWire):
@@ -249,7 +249,7 @@ def test_bytes_that_are_no_frames_end_the_check_soon():
 
     wire = Noise(made(HubInMemory, {}))
     result = check(wire)
-    assert result.failed() == ["H1"] and wire.now() < 5
+    assert result.list_failed() == ["H1"] and wire.now() < 5
 
 
 def test_a_hub_that_floods_is_an_error():

@@ -265,9 +265,9 @@ def test_hubs_keep_every_rule_on_real_lines(out, tmp_path):
             results = dict(zip(ports, pool.map(checked, ports.values()), strict=True))
             command.result()
             # A busy machine starves hubs, an emulated one first: then once more.
-            late = [name for name in ports if set(results[name].failed()) & OF_PERIODS]
+            late = [name for name in ports if set(results[name].list_failed()) & OF_PERIODS]
             results |= zip(late, pool.map(checked, [ports[name] for name in late]), strict=True)
-    assert {name: result.failed() for name, result in results.items()} == {
+    assert {name: result.list_failed() for name, result in results.items()} == {
         name: [] for name in ports
     }
     assert results["terminal"].results["S3"].outcome is Outcome.PASSED

@@ -80,7 +80,7 @@ def sent_readings(skin, log):
     samples = Samples(log)
     times_us = samples.time_ns // 1000
     load_us = times_us.copy()
-    for fault in samples.faults("hold"):
+    for fault in samples.select_faults("hold"):
         load_us[(samples.link == fault.link) & fault.contains(samples.time_ns)] = (
             fault.begin_ns // 1000
         )
@@ -89,7 +89,7 @@ def sent_readings(skin, log):
     readings = np.zeros(len(samples), make_reading_type(EACH, 8))
     readings["millihertz"] = sound_readings(skin)[instant[:, None], cube]
     readings["centi_celsius"] = TEMPERATURE_UNKNOWN
-    for fault in samples.faults(*PAD_FAULTS):
+    for fault in samples.select_faults(*PAD_FAULTS):
         rows = (samples.link == fault.link) & fault.contains(samples.time_ns)
         place = np.flatnonzero(rows), fault.fault.cube, fault.fault.pad
         if fault.kind == "report":
@@ -114,7 +114,7 @@ def recorded(skin, log, actions=(), rest_after=None):
     order = order[~samples.is_damaged[order]]
     cube = (EACH * samples.link[order, None] + np.arange(EACH)).ravel().astype(np.uint16)
     of = np.repeat(order, EACH)
-    readings = SentReadings(samples, sent).of(cube, of)
+    readings = SentReadings(samples, sent).select(cube, of)
     frequencies = FrequencyRows(
         cube=cube,
         sequence=samples.number[of].astype(np.uint32),

@@ -58,7 +58,7 @@ class HubLoad:
     pads: int = 8
 
     @classmethod
-    def of(cls, cubes: int, pads: int = 8) -> HubLoad:
+    def choose(cls, cubes: int, pads: int = 8) -> HubLoad:
         """Choose the smallest number of equal hubs that have at least `cubes` cubes together."""
         hubs = math.ceil(cubes / MAX_CUBES_PER_HUB)
         return cls(hubs, math.ceil(cubes / hubs), pads)

@@ -51,7 +51,7 @@ def bench_links(
     Raises:
         CubeError: The hubs cannot be built, or no rows arrive.
     """
-    load = HubLoad.of(cubes)
+    load = HubLoad.choose(cubes)
     cubes = load.cubes
     with tempfile.TemporaryDirectory(prefix="cube_bench_") as name:
         folder = Path(name)

@@ -147,7 +147,7 @@ def bench_found(cubes: int, bench: Bench) -> dict[str, Any]:
     chosen = {name: value for name, value in found.items() if name.startswith(("cpu_", topic))}
     cpu = {name: value for name, value in without.items() if name.startswith("cpu_")}
     return {
-        "cubes": HubLoad.of(cubes, bench.pads).cubes,
+        "cubes": HubLoad.choose(cubes, bench.pads).cubes,
         "rate_hz": bench.rate,
         "duration_s": bench.duration,
         **chosen,
@@ -185,7 +185,7 @@ def _measure_both(
     progress: Progress,
 ) -> dict[str, Any]:
     """Measure the echo before and after the chain, and compare the chain with their mean."""
-    cubes = HubLoad.of(cubes, bench.pads).cubes
+    cubes = HubLoad.choose(cubes, bench.pads).cubes
     before = _measure_echo(cubes, bench, progress)
     skin = _measure_skin(cubes, bench, progress)
     after = _measure_echo(cubes, bench, progress)
@@ -213,7 +213,7 @@ def _measure_skin(
     with tempfile.TemporaryDirectory(prefix="cube_bench_") as name:
         folder = Path(name)
         log = folder / "log"
-        load = HubLoad.of(cubes, bench.pads)
+        load = HubLoad.choose(cubes, bench.pads)
         path = load.write_skin(folder, bench.rate)
         processes = _make_processes(path, log, load, bench)
         arrivals = HubArrivals(read_skin(path))

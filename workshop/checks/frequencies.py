@@ -56,7 +56,7 @@ def check_frequencies(run: Run) -> FrequencyFindings:
     is_wrong = np.zeros(len(rows), bool)
     for part in split_in_chunks(known):
         chosen = rows.select(part)
-        is_wrong[part] = _differs(chosen, run.sent.of(chosen.cube, sample[part]))
+        is_wrong[part] = _differs(chosen, run.sent.select(chosen.cube, sample[part]))
 
     # Rows with the same key are the same row, which arrived more than once.
     n_cubes = len(record.skin.cubes)
@@ -77,8 +77,8 @@ def check_frequencies(run: Run) -> FrequencyFindings:
         "repeated": len(known) - len(arrived),
     }
     sampled_ns = samples.time_ns[np.maximum(sample, 0)]
-    examples = run.examples("wrong: cube", rows.cube, sampled_ns, is_wrong)
-    examples += run.examples("lost: link", samples.link, samples.time_ns, is_lost)
+    examples = run.describe_examples("wrong: cube", rows.cube, sampled_ns, is_wrong)
+    examples += run.describe_examples("lost: link", samples.link, samples.time_ns, is_lost)
     return FrequencyFindings(figures, examples, is_checked, missing)
 
 

@@ -98,7 +98,7 @@ def check_health(run: Run, sample: Index) -> Findings:
     evidence = _Evidence(run)
     examples, n_faults, n_unflagged = [], 0, 0
 
-    for fault in run.samples.faults(*PAD_FAULTS):
+    for fault in run.samples.select_faults(*PAD_FAULTS):
         pad = fault.fault.pad
         bit = STATUS_OF_FAULT[fault.kind]
         mine = np.flatnonzero(rows.cube == fault.cube)
@@ -181,7 +181,7 @@ class _Evidence:
     def _is_disturbed(self, span: Span) -> bool:
         """Return whether the statistics of the pads were disturbed in a span of time: by a cut of
         any link, or by the start of a node."""
-        cuts = self._run.samples.faults(*CUT_FAULTS)
+        cuts = self._run.samples.select_faults(*CUT_FAULTS)
         starts = self._run.record.select_actions(*NODE_STARTS)
         is_cut = any(cut.overlaps(span, DISTURBANCE_S) for cut in cuts)
         return is_cut or any(start.overlaps(span, RESTART_S) for start in starts)
@@ -209,7 +209,7 @@ class _Evidence:
         is_chosen = (samples.link == fault.link) & span.contains(samples.time_ns)
         chosen = np.flatnonzero(is_chosen)
         cubes = np.full(len(chosen), fault.cube)
-        readings = self._run.sent.of(cubes, chosen)
+        readings = self._run.sent.select(cubes, chosen)
         window_ns = round(NS_PER_S * WINDOW_S)
         for begin_ns in range(span.begin_ns, span.end_ns - window_ns, WINDOW_STEP_NS):
             window = Span(begin_ns, begin_ns + window_ns)

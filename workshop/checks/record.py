@@ -167,7 +167,7 @@ class Samples:
     def __len__(self) -> int:
         return len(self.link)
 
-    def faults(self, *kinds: str) -> list[HubFault]:
+    def select_faults(self, *kinds: str) -> list[HubFault]:
         """Return the faults of the given kinds, in the order of time."""
         records = [record for record in self.log.faults if record.fault.kind in kinds]
         return [self._convert(record) for record in records]
@@ -199,7 +199,7 @@ class Samples:
             after_s: Time, in s, after its end in which samples count, too.
         """
         near = np.zeros(len(self), bool)
-        for fault in self.faults(*kinds):
+        for fault in self.select_faults(*kinds):
             is_close = fault.contains(self.time_ns, before_s, after_s)
             near |= (self.link == fault.link) & is_close
         return near

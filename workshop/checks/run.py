@@ -66,7 +66,7 @@ class Run:
         seconds = (int(time_ns) - self._start_ns) / NS_PER_S
         return f"{finding}, {seconds:.3f} s"
 
-    def examples(
+    def describe_examples(
         self,
         finding: str,
         number: Integers,

@@ -155,7 +155,7 @@ class SentReadings:
         """Return whether rows (N,) mostly have the readings of samples (N,)."""
         resembles = np.zeros(len(rows), bool)
         for part in split_in_chunks(np.arange(len(rows))):
-            sent = self.of(rows.cube[part], sample[part]).frequency
+            sent = self.select(rows.cube[part], sample[part]).frequency
             # Pads that measure nothing do not tell samples apart.
             is_equal = sent == rows.frequency[part]
             is_equal |= np.isnan(sent)

@@ -113,7 +113,7 @@ def check_tensors(run: Run) -> TensorFindings:
         ("tensor of nothing", stress, is_invented),
         ("no tensor", frequencies, is_missing),
     ):
-        examples += run.examples(f"{what}: cube", rows.cube, rows.stamp_ns, is_found)
+        examples += run.describe_examples(f"{what}: cube", rows.cube, rows.stamp_ns, is_found)
     without = np.setdiff1d(sent_ns, sent_ns[n_tensors > 0])
     return TensorFindings(figures, examples, source, len(without))
 

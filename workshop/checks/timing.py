@@ -69,7 +69,7 @@ def measure_reconnects(run: Run, frequencies: FrequencyFindings) -> list[float]:
     arrived = frequencies.missing < samples.row_count
     arrived &= samples.time_ns < run.record.end_ns
     gaps_s = []
-    for fault in samples.faults("unplug", "rename"):
+    for fault in samples.select_faults("unplug", "rename"):
         is_after = samples.time_ns >= fault.end_ns
         is_of_link = samples.link == fault.link
         times_ns = samples.time_ns[arrived & is_after & is_of_link]
@@ -85,7 +85,7 @@ def count_wrong_periods(run: Run) -> int:
     disturbing = record.select_actions("rate", *DRIVER_STOPS)
     disturbances = [action.begin_ns for action in disturbing]
     disturbances.append(record.end_ns)
-    cuts = samples.faults(*CUT_FAULTS)
+    cuts = samples.select_faults(*CUT_FAULTS)
     wrong = 0
     for action in record.select_actions("rate"):
         settled = Span(action.end_ns, action.end_ns + round(NS_PER_S * RATE_CHANGE_S))
