@@ -24,7 +24,7 @@ again."""
 
 
 @contextmanager
-def ends_at_once() -> Iterator[None]:
+def end_at_once() -> Iterator[None]:
     """Let Ctrl-C end the process, even in the middle of C code.
 
     Use it only in the main thread, and for work that only computes, because no `finally` block

@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
     from ..fem.fem import compute_response
     from ..fem.model import read_model
     from ..fem.volume_loads import compute_thermal_stress, compute_weight
-    from ..interrupt import ends_at_once
+    from ..interrupt import end_at_once
     from ..studies.surface_study import study_surface
 
     model = read_model(options.model)
@@ -84,7 +84,7 @@ def run(options: argparse.Namespace) -> int:
     print(f"{cube}{place}; {layout.n_pads} pads{symmetry}", flush=True)
     result: reports.Result
     # The factorisation runs in C, where Ctrl-C would not be noticed.
-    with ends_at_once(), show_progress_bar() as report:
+    with end_at_once(), show_progress_bar() as report:
         if options.load == "surface":
             result = study_surface(
                 body,

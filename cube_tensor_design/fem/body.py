@@ -198,7 +198,7 @@ def make_mesh(
         ElasticError: Edges of pads are too close to each other.
     """
     axes = list(choose_field_axes(layout))
-    stops = _pad_edges(layout)
+    stops = _list_pad_edges(layout)
     _check_edges(stops, body.side / 2)
 
     lengths = np.array([body.width, body.depth, body.height])
@@ -225,7 +225,7 @@ def make_mesh(
     )
 
 
-def _pad_edges(layout: Layout) -> Array:
+def _list_pad_edges(layout: Layout) -> Array:
     """Return the sorted distances of pad edges from the centres of their faces, in d0 (half the
     side of the cube)."""
     half = layout.pad_size / 2

@@ -39,7 +39,7 @@ from cube_tensor_driver.core.symmetry import (
 
 from .body import Body, check_pads, choose_field_axes, make_mesh
 from .memory import check_memory
-from .solid import Parity, Solid, lame
+from .solid import Parity, Solid, compute_lame_constants
 
 Progress = Callable[[float, float, str], None]
 """Called as progress(done, total, what) before every step of a computation and at its end."""
@@ -140,7 +140,7 @@ def compute_response(
         body,
         layout,
         meshes,
-        partial(load_modes, layout=layout),
+        partial(make_mode_loads, layout=layout),
         progress,
     )
     changes = [result.change for result in results[1:]]
@@ -243,7 +243,7 @@ def solve_meshes(
         start = time.perf_counter()
         try:
             solid = make_solid(body, layout, grid)
-            pads = pad_stresses(solid, layout, load(solid), report_solve)
+            pads = compute_pad_stresses(solid, layout, load(solid), report_solve)
         except MemoryError:  # Some limit that check_memory does not know was reached.
             raise ElasticError(
                 f"the memory ran out on mesh {number}, of {grid.nvertices} corners; "
@@ -325,15 +325,15 @@ def make_solid(
     plane = body.plane if layout.planar else "strain"
     cube = None
     if not np.isinf(body.cube_young):
-        cube = lame(body.cube_young / body.young, body.cube_poisson, plane)
+        cube = compute_lame_constants(body.cube_young / body.young, body.cube_poisson, plane)
     elif body.ground:
         # A rigid cube moves with a body on ground, so it is a very stiff elastic one here.
-        cube = lame(STIFF_CUBE_RATIO, 0.0, plane)
-    elastomer = lame(1.0, body.poisson, plane)
+        cube = compute_lame_constants(STIFF_CUBE_RATIO, 0.0, plane)
+    elastomer = compute_lame_constants(1.0, body.poisson, plane)
     return Solid(grid, elastomer, cube, body.ground, body.confined)
 
 
-def load_modes(solid: Solid, layout: Layout) -> Load:
+def make_mode_loads(solid: Solid, layout: Layout) -> Load:
     """Return the tractions of all modes of a layout on the outer faces of a body.
 
     The stresses of the pads under a unit amplitude of each mode are the columns of the response
@@ -348,16 +348,16 @@ def load_modes(solid: Solid, layout: Layout) -> Load:
     def field(x: Array) -> Array:
         return stress + np.einsum("mijk,qk->qmij", gradient, x)
 
-    return load_outside(solid, field)
+    return make_outside_load(solid, field)
 
 
-def load_outside(solid: Solid, field: Callable[[Array], Array]) -> Load:
+def make_outside_load(solid: Solid, field: Callable[[Array], Array]) -> Load:
     """Return the tractions of a field on the outer faces of a body, see
     `Solid.compute_outer_forces`."""
     return lambda parity: [solid.compute_outer_forces(parity, field)]
 
 
-def pad_stresses(
+def compute_pad_stresses(
     solid: Solid,
     layout: Layout,
     load: Load,
@@ -379,7 +379,7 @@ def pad_stresses(
         # Most loads have no part of this parity and need no solve.
         largest = np.abs(forces).max(axis=0)
         used = np.flatnonzero(largest > NO_FORCE * largest.max())
-        weights = solid.pad_weights(layout, parity)
+        weights = solid.compute_pad_weights(layout, parity)
         if len(used) and weights.any():
             # At the faces of the cube, the nodal forces of the stress in the elastomer exceed the
             # loads on the elastomer by the forces with which the cube acts on it.

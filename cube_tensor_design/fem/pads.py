@@ -38,7 +38,7 @@ SAME_PLACE = 1e-9
 line of its face."""
 
 
-def pad_weights(
+def compute_pad_weights(
     positions: Array,
     order: int,
     layout: Layout,

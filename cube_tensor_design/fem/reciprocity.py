@@ -27,7 +27,7 @@ from cube_tensor_driver.mechanics.layer import Layer
 from .body import Body, check_pads, make_mesh
 from .fem import iterate_parities, make_solid
 from .memory import check_memory
-from .solid import Solid, mirror_images
+from .solid import Solid, list_mirror_images
 
 
 def compute_influence(
@@ -82,12 +82,12 @@ def _compute_surface_influence(
     total: Array | float = 0.0
     for parity in iterate_parities(solid):
         # One solve has the weights of all pads as its right-hand sides.
-        gaps = solid.pad_weights(layout, parity).T
+        gaps = solid.compute_pad_weights(layout, parity).T
         displacement = solid.solve(parity, solid.body @ gaps)
         on_surface = np.moveaxis(displacement[dofs], -1, 0)  # (P, n, dim)
         # Mirrored points have mirrored displacements: `images` changes the sign of the component
         # along a mirrored axis, and `weights` has the sign of the parity.
-        images, weights = mirror_images(parity)
+        images, weights = list_mirror_images(parity)
         flip = weights[:, None] * images
         total = total + on_surface[:, None] * flip[:, None]
 

@@ -28,7 +28,7 @@ from skfem.models.elasticity import lame_parameters
 from cube_tensor_driver.core.arrays import Array, Index, Mask
 from cube_tensor_driver.core.layout import Layout
 
-from .pads import SAME_COORDINATE, pad_weights
+from .pads import SAME_COORDINATE, compute_pad_weights
 
 Parity = tuple[int, ...]
 """For each axis +1 where a field is even under the mirror x_k -> -x_k, -1 where the field is odd, 0
@@ -43,7 +43,7 @@ def _is_at(x: Array, value: float | Array) -> Mask:
     return np.abs(x - value) < SAME_COORDINATE
 
 
-def lame(
+def compute_lame_constants(
     young: float,
     poisson: float,
     plane: str = "strain",
@@ -59,7 +59,7 @@ def lame(
     return lam, mu
 
 
-def stiffness(scalar: skfem.Basis, moduli: tuple[float, float]) -> sp.csr_matrix:
+def assemble_stiffness(scalar: skfem.Basis, moduli: tuple[float, float]) -> sp.csr_matrix:
     """Assemble the stiffness K_ij = int lambda div w_i div w_j + 2 mu eps(w_i) : eps(w_j) dV.
 
     w_i are the vector-valued nodal functions and eps their strain. The sparse matrix (dofs, dofs)
@@ -89,7 +89,7 @@ def stiffness(scalar: skfem.Basis, moduli: tuple[float, float]) -> sp.csr_matrix
     return sum(blocks).tocsr()
 
 
-def sample_matrix(basis: skfem.Basis, values: Array) -> sp.csr_matrix:
+def make_sample_matrix(basis: skfem.Basis, values: Array) -> sp.csr_matrix:
     """Return the sparse matrix (S, dofs) from unknowns to samples at the quadrature points.
 
     Args:
@@ -180,10 +180,10 @@ class Solid:
         self._axis_kind = [coordinates.index(line) for line in coordinates]
         self._last_solve: _Factors | None = None
 
-        self.body = stiffness(self.select_elements(in_cube=False), body)
+        self.body = assemble_stiffness(self.select_elements(in_cube=False), body)
         self.total = self.body
         if cube is not None:
-            self.total = self.body + stiffness(self.select_elements(in_cube=True), cube)
+            self.total = self.body + assemble_stiffness(self.select_elements(in_cube=True), cube)
 
     def compute_outer_forces(
         self,
@@ -220,7 +220,7 @@ class Solid:
             by_point = traction.reshape(face.dx.size, -1)
             # A quadrature point loads the nodes whose functions are not zero there.
             values = [np.asarray(shape[0]) for shape in face.basis]
-            samples = sample_matrix(face, np.stack(values) * face.dx)
+            samples = make_sample_matrix(face, np.stack(values) * face.dx)
             forces = samples.T @ by_point
             by_node = forces.reshape(face.N, -1, self.dim)
             by_dof = by_node.swapaxes(1, 2).reshape(len(self.component), -1)
@@ -296,12 +296,12 @@ class Solid:
         elements = np.flatnonzero(is_cube == in_cube)
         return self.basis.with_elements(elements)
 
-    def pad_weights(self, layout: Layout, parity: Parity) -> Array:
+    def compute_pad_weights(self, layout: Layout, parity: Parity) -> Array:
         """Return weights (P, dofs) from nodal forces on the body to the mean stresses of the pads.
 
         These forces, `body` @ u on the surface of the cube, are those of the cube on the elastomer.
         """
-        return -pad_weights(self.positions, self.order, layout, parity)
+        return -compute_pad_weights(self.positions, self.order, layout, parity)
 
     def _find_held(self, parity: Parity) -> Mask:
         """Return which unknowns (dofs,) are held at zero.
@@ -358,7 +358,7 @@ def _select_parity_part(
     This part is the mean of the field over all mirrored points, with the signs of the parity.
     """
     part = np.zeros(())
-    images, weights = mirror_images(parity)
+    images, weights = list_mirror_images(parity)
     for image, weight in zip(images, weights, strict=True):
         # A component sigma_ij changes its sign with each of its axes that is mirrored.
         signs = np.outer(image, image)
@@ -367,7 +367,7 @@ def _select_parity_part(
     return part
 
 
-def mirror_images(parity: Parity) -> tuple[Array, Array]:
+def list_mirror_images(parity: Parity) -> tuple[Array, Array]:
     """Return the M images under mirrors of the meshed part, which together make the whole body.
 
     Returns:

@@ -37,7 +37,7 @@ from cube_tensor_driver.core.layout import Layout
 
 from .body import Body, choose_field_axes
 from .fem import Load, Progress, solve_meshes
-from .solid import Parity, Solid, mirror_images
+from .solid import Parity, Solid, list_mirror_images
 
 N_PROFILES = 6
 """Number of Legendre polynomials of the height, 1 + the highest degree. The diffusion of heat
@@ -178,7 +178,7 @@ def compute_weight(
             parts.append(-density * by_component)
 
         def select_parity(parity: Parity) -> Sequence[Array]:
-            images, weights = mirror_images(parity)
+            images, weights = list_mirror_images(parity)
             # A uniform force along an axis is odd under the mirror of that axis, and even under the
             # others. So `has_parity` is 1 for the axes along which forces have this parity, else 0.
             has_parity = weights @ images

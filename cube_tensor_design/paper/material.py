@@ -40,16 +40,16 @@ class Material:
     mu: Array
     finite: bool
 
-    def energy(self, f: Array) -> Array:
+    def compute_energy(self, f: Array) -> Array:
         """Return W (E, Q), in Pa, where the deformation is F (2, 2, E, Q)."""
         if not self.finite:
-            return ddot(f - IDENTITY, self.stress(f)) / 2
+            return ddot(f - IDENTITY, self.compute_stress(f)) / 2
         log = np.log(det(f))
         square = ddot(f, f)
         distortion = self.mu / 2 * (square - 2 - 2 * log)
         return distortion + self.lam / 2 * log**2
 
-    def stress(self, f: Array) -> Array:
+    def compute_stress(self, f: Array) -> Array:
         """Return the first Piola-Kirchhoff stress P = dW/dF (2, 2, E, Q), in Pa.
 
         P is the force over the undeformed area.
@@ -63,17 +63,17 @@ class Material:
         pressure_part = self.lam * log * inverse
         return self.mu * (f - inverse) + pressure_part
 
-    def cauchy(self, f: Array) -> Array:
+    def compute_cauchy_stress(self, f: Array) -> Array:
         """Return the true stress P Fᵀ / J (2, 2, E, Q), in Pa: the force over the deformed area.
 
         In a linear material the true stress is P itself.
         """
-        p = self.stress(f)
+        p = self.compute_stress(f)
         if not self.finite:
             return p
         return mul(p, transpose(f)) / det(f)
 
-    def moduli(self, f: Array) -> Array:
+    def compute_moduli(self, f: Array) -> Array:
         """Return the moduli dP_ij/dF_kl (2, 2, 2, 2, E, Q), in Pa; Q is 1 for a linear material,
         which has the same moduli at all points."""
         inverse = IDENTITY

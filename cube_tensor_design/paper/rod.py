@@ -59,7 +59,7 @@ class Rod:
     width: float = 5e-3
     edge_radius: float = 1e-3
 
-    def lower_side(
+    def compute_lower_side(
         self,
         x: Array,
         top: float,
@@ -119,19 +119,19 @@ class RodContact:
         self._stiffness = STIFFNESS_RATIO * young
         self._finite = float(finite)
 
-    def energy(self, u: Array) -> float:
+    def compute_energy(self, u: Array) -> float:
         """Return the energy at displacements u (dofs,)."""
         p = self._compute_penetration(u).p
         density = self._stiffness / 2 * p**2
         return float((density * self._facets.dx).sum())
 
-    def force(self, u: Array) -> Array:
+    def compute_force(self, u: Array) -> Array:
         """Return the nodal forces (dofs,) at displacements u (dofs,)."""
         at = self._compute_penetration(u)
         pressure = self._stiffness * at.p * at.dp
         return _PUSH.assemble(self._facets, pressure=pressure, slope=at.slope)
 
-    def tangent(self, u: Array) -> sp.csr_matrix:
+    def compute_tangent(self, u: Array) -> sp.csr_matrix:
         """Return the derivative of the nodal forces, sparse (dofs, dofs)."""
         at = self._compute_penetration(u)
         # The pressure is k p dp/dg, with the stiffness k, the penetration p and the gap g. `normal`
@@ -141,7 +141,7 @@ class RodContact:
         bending = -pressure * at.curvature
         return self._assemble(normal, at.slope, bending)
 
-    def secant(self, u: Array, v: Array) -> sp.csr_matrix:
+    def compute_secant(self, u: Array, v: Array) -> sp.csr_matrix:
         """Return S, sparse (dofs, dofs), with S (u - v) = force(u) - force(v); linear theory."""
         at = self._compute_penetration(u)
         other = self._compute_penetration(v)
@@ -175,7 +175,7 @@ class RodContact:
         moved = np.asarray(self._facets.interpolate(u))
         position = x[0] + self._finite * moved[0]
         top = x[1].max()
-        height, slope, curvature = self._rod.lower_side(
+        height, slope, curvature = self._rod.compute_lower_side(
             position,
             top,
             self._unit,

@@ -41,7 +41,7 @@ from cube_tensor_driver.core.layout import LAYOUTS
 
 from ..fem.body import Body, strip_layout
 from ..fem.fem import Progress, count_steps
-from ..fem.solid import lame
+from ..fem.solid import compute_lame_constants
 from .experiments import SHEAR_SIGNS, make_dent_step
 from .newton import factorise
 from .rod import ROD_DEPTH, Rod
@@ -107,7 +107,7 @@ def split_rod_signals(
         Parts by "rounded rod, strips" and so on, of `RADII` and `PADS`.
     """
     bench = VirtualBench(body or Body())
-    signals = [P_SHEAR @ bench.pad_weights(layout) for layout in PADS.values()]
+    signals = [P_SHEAR @ bench.compute_pad_weights(layout) for layout in PADS.values()]
     found: dict[str, RodParts] = {}
     report = count_steps(progress, len(RADII) * len(places))
     for rod, radius in RADII.items():
@@ -164,7 +164,7 @@ def split_signals(
     Args:
         bench: A linear bench with the cube.
         step: A step with a bonded bottom.
-        signals: (dofs,) weights of the nodal forces on the cube, from `VirtualBench.pad_weights`.
+        signals: (dofs,) weights of the nodal forces on the cube, from `VirtualBench.compute_pad_weights`.
         held: Quantity of the rod that the cube does not change.
     """
     if bench.finite or step.sliding:
@@ -177,7 +177,7 @@ def split_signals(
     if u is None or field is None:
         raise ElasticError("the load is too large for one step; press less")
 
-    free = bench.free(step)
+    free = bench.find_free(step)
     matrix = _superpose_matrix(bench, step, with_cube, u, field)
     solver = factorise(matrix)
     rows = []
@@ -239,15 +239,15 @@ def _superpose_matrix(
         u: (dofs,) displacements with the cube.
         field: (dofs,) displacements without it.
     """
-    free = bench.free(step)
-    matrix = bench.section.tangent(u)[free][:, free]
+    free = bench.find_free(step)
+    matrix = bench.section.compute_tangent(u)[free][:, free]
     if step.rod is None or with_cube.rod is None:
         return matrix
     along_z = (bench.section.component == 1).astype(float)
     half_side = bench.body.side / 2
     drawn_back = (step.rod.pressed - with_cube.rod.pressed) / half_side
     contact = bench.make_rod_contact(step.rod)
-    springs = contact.secant(u - drawn_back * along_z, field)
+    springs = contact.compute_secant(u - drawn_back * along_z, field)
     matrix = matrix + springs[free][:, free]
     if with_cube is step:
         return matrix
@@ -266,8 +266,8 @@ def _compute_forces(
 ) -> Array:
     """Return the nodal forces (dofs,) of some elements at displacements u (dofs,)."""
     section = bench.section
-    stress = section.material.stress(section.compute_deformation(u))
-    return section.forces(stress, elements)
+    stress = section.material.compute_stress(section.compute_deformation(u))
+    return section.compute_forces(stress, elements)
 
 
 def _make_polynomials(bench: VirtualBench) -> tuple[Array, Index]:
@@ -275,7 +275,7 @@ def _make_polynomials(bench: VirtualBench) -> tuple[Array, Index]:
     number in `PARTS` of the part (n,) to which each belongs."""
     body = bench.body
     section = bench.section
-    lam, mu = lame(body.young, body.poisson, body.plane)
+    lam, mu = compute_lame_constants(body.young, body.poisson, body.plane)
     ratio = (lam + 3 * mu) / (lam + mu)
     x, y = section.basis.doflocs
     z = x + 1j * y

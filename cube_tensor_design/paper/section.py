@@ -18,7 +18,7 @@ from skfem.helpers import det
 
 from cube_tensor_driver.core.arrays import Array, Mask
 
-from ..fem.solid import sample_matrix
+from ..fem.solid import make_sample_matrix
 from .material import IDENTITY, Material
 from .newton import Balance
 
@@ -47,7 +47,7 @@ class Section:
         # points from the unknowns u.
         gradients = [shape[0].grad for shape in self.basis.basis]
         slopes = np.stack(gradients)
-        self._gradient = sample_matrix(self.basis, slopes)
+        self._gradient = make_sample_matrix(self.basis, slopes)
         self._linear_tangent: sp.csr_matrix | None = None
         self._set_up_tangent(slopes)
 
@@ -92,12 +92,12 @@ class Section:
         # Linear theory does not limit the change of volume.
         if self.material.finite and det(f).min() <= 0:
             return None
-        density = self.material.energy(f)
+        density = self.material.compute_energy(f)
         energy = float((density * self.basis.dx).sum())
-        forces = self.forces(self.material.stress(f))
+        forces = self.compute_forces(self.material.compute_stress(f))
         return Balance(forces, energy)
 
-    def forces(self, stress: Array, elements: Mask | bool = True) -> Array:
+    def compute_forces(self, stress: Array, elements: Mask | bool = True) -> Array:
         """Return the nodal forces (dofs,) of a stress over some of the elements.
 
         Args:
@@ -109,7 +109,7 @@ class Section:
         weighted = stress * volume
         return weighted.ravel() @ self._gradient
 
-    def tangent(self, u: Array) -> sp.csr_matrix:
+    def compute_tangent(self, u: Array) -> sp.csr_matrix:
         """Return the derivative of the nodal forces by u, sparse (dofs, dofs).
 
         The derivative of a linear material does not depend on u, and is assembled once.
@@ -118,7 +118,7 @@ class Section:
             return self._linear_tangent
         volume = self.basis.dx
         n_elements, n_points = volume.shape
-        moduli = self.material.moduli(self.compute_deformation(u))
+        moduli = self.material.compute_moduli(self.compute_deformation(u))
         weighted = moduli * volume
         by_component = weighted.reshape(4, 4, n_elements, n_points)
         by_point = np.moveaxis(by_component, (0, 1), (2, 3))

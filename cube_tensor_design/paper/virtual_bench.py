@@ -26,8 +26,8 @@ from cube_tensor_driver.core.tensor import rotation_from_rpy
 from ..fem.body import Body
 from ..fem.memory import check_memory
 from ..fem.mesh import mesh_quarter, mirror_quarter
-from ..fem.pads import pad_weights
-from ..fem.solid import lame
+from ..fem.pads import compute_pad_weights
+from ..fem.solid import compute_lame_constants
 from .material import Material
 from .newton import Balance, factorise, find_balance
 from .rod import Rod, RodContact
@@ -166,7 +166,7 @@ class VirtualBench:
         check_memory(mesh, BYTES_PER_CORNER)
         centres = mesh.p[:, mesh.t].mean(axis=1)
         self.in_cube = np.all(np.abs(centres) < 1.0, axis=0)
-        lam, mu = lame(body.young, body.poisson, body.plane)
+        lam, mu = compute_lame_constants(body.young, body.poisson, body.plane)
         ratio = np.where(self.in_cube & cube, CUBE_STIFFNESS_RATIO, 1.0)
         stiffness = ratio[:, None]  # The same at all points of an element.
         material = Material(lam * stiffness, mu * stiffness, finite)
@@ -206,7 +206,7 @@ class VirtualBench:
             u = position.u
             if not step.gripped:
                 loose = u
-            results = self._pad_stresses(u), self._state(u), self._compute_rotation(u)
+            results = self._compute_pad_stresses(u), self._fit_state(u), self._compute_rotation(u)
             rows.append(results)
             report()
         columns = zip(*rows, strict=True)
@@ -228,13 +228,13 @@ class VirtualBench:
         u = self.solve(step)
         if u is None or step.rod is None or self.finite:
             raise ElasticError("give a linear step with a rod, that presses less")
-        force = self.make_rod_contact(step.rod).force(u)
+        force = self.make_rod_contact(step.rod).compute_force(u)
         is_along_z = self.section.component == 1
         dofs = np.flatnonzero((force != 0) & is_along_z)
         positions = self.section.basis.doflocs[0, dofs]
         return self._half_side * positions, self._half_side * force[dofs]
 
-    def pad_weights(self, layout: Layout, angle: float = 0.0) -> Array:
+    def compute_pad_weights(self, layout: Layout, angle: float = 0.0) -> Array:
         """Return weights (P, dofs) from nodal forces on the cube to the mean stresses of the pads.
 
         Args:
@@ -243,7 +243,7 @@ class VirtualBench:
         """
         rotation = rotation_from_rpy(0, -angle, 0)[::2, ::2]
         positions = self.section.basis.doflocs
-        return pad_weights(positions, 2, layout, (0, 0), rotation)
+        return compute_pad_weights(positions, 2, layout, (0, 0), rotation)
 
     def remove_cube(self) -> VirtualBench:
         """Return a linear bench of the same mesh, with elastomer in the cube's place."""
@@ -256,7 +256,7 @@ class VirtualBench:
         bench.section = Section(self.section.mesh, elastomer)
         return bench
 
-    def free(self, step: LoadStep) -> Index:
+    def find_free(self, step: LoadStep) -> Index:
         """Return the numbers of the unknown displacements that a step from rest does not
         prescribe."""
         task = self._make_task(step, np.zeros(self.section.basis.N))
@@ -284,7 +284,7 @@ class VirtualBench:
         section = self.section
         mesh = self.section.mesh
         linear_part = np.einsum("ijk,keq->ijeq", gradient, section.points)
-        force = section.forces(stress[:, :, None, None] + linear_part)
+        force = section.compute_forces(stress[:, :, None, None] + linear_part)
         # Three unknowns stop the rigid motions; the loads balance, so they bear no force.
         centre = section.find_node(0.0, 0.0)
         side = section.find_node(1.0, 0.0)
@@ -292,9 +292,9 @@ class VirtualBench:
         pinned = [*nodal_dofs[:, centre], nodal_dofs[1, side]]
         free = np.setdiff1d(np.arange(section.basis.N), pinned)
         u = np.zeros(section.basis.N)
-        matrix = section.tangent(u)[free][:, free]
+        matrix = section.compute_tangent(u)[free][:, free]
         u[free] = factorise(matrix).solve(force[free])
-        result = section.material.stress(section.compute_deformation(u))
+        result = section.material.compute_stress(section.compute_deformation(u))
         return Deformation(
             points=mesh.p,
             triangles=mesh.t,
@@ -374,8 +374,8 @@ class VirtualBench:
         contact = self.make_rod_contact(task.rod) if task.rod else None
 
         def tangent(u: Array) -> sp.csr_matrix:
-            inner = self.section.tangent(u)
-            return inner if contact is None else inner + contact.tangent(u)
+            inner = self.section.compute_tangent(u)
+            return inner if contact is None else inner + contact.compute_tangent(u)
 
         # Even a linear body has a contact that is not linear.
         linear = not self.finite and contact is None
@@ -395,8 +395,8 @@ class VirtualBench:
         inner = self.section.balance(u)
         if inner is None or contact is None:
             return inner
-        force = inner.force + contact.force(u)
-        energy = inner.energy + contact.energy(u)
+        force = inner.force + contact.compute_force(u)
+        energy = inner.energy + contact.compute_energy(u)
         return Balance(force, energy)
 
     def _compute_rotation(self, u: Array) -> float:
@@ -408,24 +408,24 @@ class VirtualBench:
         along_x, along_z = right - left
         return float(np.arctan2(along_z, 2.0 + along_x))
 
-    def _pad_stresses(self, u: Array) -> Array:
+    def _compute_pad_stresses(self, u: Array) -> Array:
         """Return the mean normal stress (P,) of the pads in the rotated frame of the cube, in Pa.
 
         The stress is computed from the nodal forces of the elastomer on the cube.
         """
         section = self.section
-        stress = section.material.stress(section.compute_deformation(u))
-        force = -section.forces(stress, ~self.in_cube)
+        stress = section.material.compute_stress(section.compute_deformation(u))
+        force = -section.compute_forces(stress, ~self.in_cube)
         angle = self._compute_rotation(u) if self.finite else 0.0  # Linear theory has no rotation.
-        return self.pad_weights(self.layout, angle) @ force
+        return self.compute_pad_weights(self.layout, angle) @ force
 
-    def _state(self, u: Array) -> Array:
+    def _fit_state(self, u: Array) -> Array:
         """Return amplitudes (7,) of the plane modes (linear stress fields), in Pa, fitted to the
         true stress within d0/2 of the centre."""
         section = self.section
         is_near = np.all(np.abs(section.points) < 0.5, axis=0)
         f = section.compute_deformation(u)
-        stress = section.material.cauchy(f)
+        stress = section.material.compute_cauchy_stress(f)
         stress = stress[:, :, is_near]
         x = section.points[:, is_near]
         ones = np.ones(x.shape[1])

@@ -30,11 +30,11 @@ from cube_tensor_driver.mechanics import contact
 from ..fem.body import Body, make_mesh
 from ..fem.fem import (
     Progress,
+    compute_pad_stresses,
     count_steps,
-    load_modes,
-    load_outside,
+    make_mode_loads,
+    make_outside_load,
     make_solid,
-    pad_stresses,
 )
 from ..fem.memory import check_memory
 
@@ -207,8 +207,8 @@ def _solve_box(
 
     # All parities are solved for the modes and for the passages.
     report = count_steps(progress, 2 * len(solid.parities))
-    matrix = pad_stresses(solid, layout, load_modes(solid, layout), report)
-    pads = pad_stresses(solid, layout, load_outside(solid, field), report)
+    matrix = compute_pad_stresses(solid, layout, make_mode_loads(solid, layout), report)
+    pads = compute_pad_stresses(solid, layout, make_outside_load(solid, field), report)
     report("done")
     return matrix, pads
 

@@ -82,7 +82,7 @@ class LayerBench(TractionBench):
         force: Array,
         centre: Array,
     ) -> Array:
-        sources, forces = self.point_forces(width, force, centre)
+        sources, forces = self.compute_point_forces(width, force, centre)
         rotation = self.poses.rotation
         # Positions and forces in the frame of each cube.
         from_cube = sources - self.poses.position[:, None]

@@ -213,7 +213,7 @@ class TractionBench:
             unit_fields = self._true_layer.field(points - centre, width / 2)
             return unit_fields @ force
         depth = self.setting.depth + self.setting.depth_error
-        load = self.point_forces(width, force, centre)
+        load = self.compute_point_forces(width, force, centre)
         return compute_field_below(points, depth, load, self.setting.poisson)
 
     def compute_surface_truth(
@@ -225,7 +225,7 @@ class TractionBench:
         """Return the true pressure (M,) on the surface, in Pa, as the mean over the square of each
         point of the inverse."""
         inverse = self.inverse
-        sources, forces = self.point_forces(
+        sources, forces = self.compute_point_forces(
             width,
             force,
             centre,
@@ -237,7 +237,7 @@ class TractionBench:
         total = np.bincount(nearest, -forces[:, 2], len(inverse.points))
         return total / inverse.area
 
-    def point_forces(
+    def compute_point_forces(
         self,
         width: float,
         force: Array,
@@ -309,7 +309,7 @@ class TractionBench:
         result = self._pipeline.process(rows, left_out)
         return np.concatenate([result.stress, result.gradient], axis=1)
 
-    def load(self, random: np.random.Generator) -> tuple[Array, Array]:
+    def draw_load(self, random: np.random.Generator) -> tuple[Array, Array]:
         """Return a random force (3,) in N, and its position (2,) in the cell around the middle
         cube, in m."""
         force = draw_force(random)
@@ -355,7 +355,7 @@ class TractionBench:
             with contacts over the predicted variance, at the cubes' depth, and on the surface.
             Whether the inverse found one contact.
         """
-        force, centre = self.load(random)
+        force, centre = self.draw_load(random)
         # Near the edge of the skin there are cubes on one side only, so it does not count.
         points = self.inverse.points[self.window, :2]
         true = -self.compute_truth(points, width, force, centre)[:, 2]

@@ -22,7 +22,7 @@ from cube_tensor_design.fem import fem, memory, mesh
 from cube_tensor_design.fem.body import Body, strip_layout
 from cube_tensor_design.fem.fem import compute_response
 from cube_tensor_design.fem.pads import compute_interval_weights
-from cube_tensor_design.fem.solid import Solid, lame, stiffness
+from cube_tensor_design.fem.solid import Solid, assemble_stiffness, compute_lame_constants
 from cube_tensor_design.fem.volume_loads import (
     N_PROFILES,
     compute_thermal_stress,
@@ -136,7 +136,7 @@ def disc_pad_error(poisson, cuts):
     r, angle = 3.0 ** curved.doflocs[0], np.pi / 2 * curved.doflocs[1]
     ring = skfem.MeshTri2(np.stack([r * np.cos(angle), r * np.sin(angle)]), curved.t)
     basis = skfem.Basis(ring, skfem.ElementVector(skfem.ElementTriP4()), intorder=10)
-    matrix = linear_elasticity(*lame(1.0, poisson)).assemble(basis)
+    matrix = linear_elasticity(*compute_lame_constants(1.0, poisson)).assemble(basis)
     x = basis.doflocs
     edges = ring.boundary_facets()
     middle = ring.p[:, ring.facets[:, edges]].mean(axis=1)
@@ -184,10 +184,12 @@ def test_rigid_disc_converges_to_the_closed_form(poisson):
 # balance, symmetry, equivalences
 
 
-@pytest.mark.parametrize("cube", [None, lame(6e5, 0.3)], ids=["rigid", "elastic"])
+@pytest.mark.parametrize("cube", [None, compute_lame_constants(6e5, 0.3)], ids=["rigid", "elastic"])
 def test_nothing_holds_the_cube(cube):
     """What the mirrors and the pin leave free must balance: no net force or couple on the cube."""
-    body = Solid(mesh.mesh_quarter((15.0, 2.75), (0.0, 1.0)), lame(1.0, 0.48), cube)
+    body = Solid(
+        mesh.mesh_quarter((15.0, 2.75), (0.0, 1.0)), compute_lame_constants(1.0, 0.48), cube
+    )
     x, c = body.positions, body.component
     stress = np.array([[0.0, 1.0], [1.0, 0.0]])
     gradient = np.zeros((2, 2, 2))
@@ -251,11 +253,13 @@ def test_the_default_is_right():
     default = read_calibration(ROOT / "config" / "calibration" / "planar_slab.yaml").response
     finer = Solid(
         mesh.mesh_quarter((15.0, 2.75), (0.3, 0.7), 3, smallest=0.01),
-        lame(1.0, 0.48),
-        lame(200e9 / 0.3e6, 0.3),
+        compute_lame_constants(1.0, 0.48),
+        compute_lame_constants(200e9 / 0.3e6, 0.3),
     )
     structure = fem.find_structure(layout, "full")
-    truth, _ = project(structure, fem.pad_stresses(finer, layout, fem.load_modes(finer, layout)))
+    truth, _ = project(
+        structure, fem.compute_pad_stresses(finer, layout, fem.make_mode_loads(finer, layout))
+    )
     assert (
         1.5 * fem.make_solid(body, layout, bodies.make_mesh(body, layout, 2)).basis.N
         < finer.basis.N
@@ -306,14 +310,14 @@ def bricks():
     grid = mesh.mesh_box(
         (0.0, 0.0, 0.0), (3.0, 3.0, 2.5), (0.2, 0.7), size=1.0, smallest=0.3, growth=6.0
     )
-    return Solid(grid, lame(1.0, 0.48), None)
+    return Solid(grid, compute_lame_constants(1.0, 0.48), None)
 
 
 def test_stiffness_is_that_of_vector_elements(bricks):
     part = bricks.select_elements(in_cube=False)
     vectors = part.with_element(skfem.ElementVector(part.elem))
     other = linear_elasticity(2.0, 0.3).assemble(vectors)
-    assert abs(stiffness(part, (2.0, 0.3)) - other).max() < 1e-12 * abs(other).max()
+    assert abs(assemble_stiffness(part, (2.0, 0.3)) - other).max() < 1e-12 * abs(other).max()
 
 
 @pytest.mark.parametrize("parity", [(1, -1, 1), (-1, 1, -1), (-1, -1, -1)])
@@ -351,7 +355,7 @@ def test_any_field_as_outer_tractions(coarse):
     def field(x):
         return stress + np.einsum("nijk,qk->qnij", gradient, x)
 
-    pads = fem.pad_stresses(solid, layout, fem.load_outside(solid, field))
+    pads = fem.compute_pad_stresses(solid, layout, fem.make_outside_load(solid, field))
     matrix = compute_response(body, layout, "none", meshes=1).matrix
     assert np.abs(pads - matrix @ state).max() < 1e-6 * np.abs(pads).max()
 

@@ -228,7 +228,7 @@ def test_defaults(computed, model):
         cube_poisson=0.30,
         plane="strain",
     )
-    assert layout.same_as(LAYOUTS["planar"])
+    assert layout.has_same_pads(LAYOUTS["planar"])
     assert (symmetry, meshes) == ("slab" if model else "full", 3)
 
 
@@ -444,11 +444,11 @@ def test_control_c_ends_work_in_c():
     """A lock that C code waits for without end, as a factorisation that no signal interrupts."""
     code = """
 import ctypes, signal
-from cube_tensor_design.interrupt import ends_at_once
+from cube_tensor_design.interrupt import end_at_once
 
 signal.signal(signal.SIGINT, lambda *_: None)  # also where the signal comes before the wait
 libc, lock = ctypes.CDLL(None), ctypes.create_string_buffer(64)
-with ends_at_once():
+with end_at_once():
     libc.pthread_mutex_lock(lock)
     print("waiting", flush=True)
     libc.pthread_mutex_lock(lock)
@@ -467,7 +467,7 @@ def test_an_interrupted_run_leaves_no_file(tmp_path, monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("cube_tensor_design.fem.fem.pad_stresses", interrupt)
+    monkeypatch.setattr("cube_tensor_design.fem.fem.compute_pad_stresses", interrupt)
     assert (
         cli.main(["fem", "-o", str(tmp_path / "cube.yaml"), "--json", str(tmp_path / "fem.json")])
         == 130

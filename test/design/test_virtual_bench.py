@@ -51,10 +51,14 @@ def test_stress_and_moduli_are_derivatives_of_the_energy(finite):
     random, h = np.random.default_rng(3), 1e-6
     f = np.eye(2)[:, :, None, None] + 0.2 * random.normal(size=(2, 2, 2, 3))
     df = random.normal(size=f.shape)
-    slope = (material.energy(f + h * df) - material.energy(f - h * df)) / (2 * h)
-    assert np.einsum("ijeq,ijeq->eq", material.stress(f), df) == pytest.approx(slope, rel=1e-7)
-    change = (material.stress(f + h * df) - material.stress(f - h * df)) / (2 * h)
-    assert np.einsum("ijkleq,kleq->ijeq", material.moduli(f), df) == pytest.approx(change, rel=1e-6)
+    slope = (material.compute_energy(f + h * df) - material.compute_energy(f - h * df)) / (2 * h)
+    assert np.einsum("ijeq,ijeq->eq", material.compute_stress(f), df) == pytest.approx(
+        slope, rel=1e-7
+    )
+    change = (material.compute_stress(f + h * df) - material.compute_stress(f - h * df)) / (2 * h)
+    assert np.einsum("ijkleq,kleq->ijeq", material.compute_moduli(f), df) == pytest.approx(
+        change, rel=1e-6
+    )
 
 
 @pytest.mark.parametrize("finite", [False, True])
@@ -128,7 +132,7 @@ def test_a_round_rod_presses_as_hertz_says():
     rod = Rod(1e-3, 0.0, 2 * radius, radius)
     u, basis = bench.solve(make_dent_step(body, rod)), bench.section.basis
     vertical = np.concatenate([basis.nodal_dofs[1], basis.facet_dofs[1]])
-    force = 5e-3 * bench.make_rod_contact(rod).force(u)[vertical]
+    force = 5e-3 * bench.make_rod_contact(rod).compute_force(u)[vertical]
     square = force @ (5e-3 * basis.doflocs[0, vertical]) ** 2 / force.sum()
     assert 4e-3 < 2 * np.sqrt(square) < 7e-3
     assert force.sum() == pytest.approx(
@@ -143,10 +147,10 @@ def test_the_rods_force_and_tangent_are_derivatives_of_its_energy(coarse, finite
     random = np.random.default_rng(8)
     u, du = 0.05 * random.normal(size=(2, bench.section.basis.N))
     h = 1e-6
-    slope = (contact.energy(u + h * du) - contact.energy(u - h * du)) / (2 * h)
-    assert contact.force(u) @ du == pytest.approx(slope, rel=1e-6)
-    change = (contact.force(u + h * du) - contact.force(u - h * du)) / (2 * h)
-    assert np.abs(contact.tangent(u) @ du - change).max() < 1e-5 * np.abs(change).max()
+    slope = (contact.compute_energy(u + h * du) - contact.compute_energy(u - h * du)) / (2 * h)
+    assert contact.compute_force(u) @ du == pytest.approx(slope, rel=1e-6)
+    change = (contact.compute_force(u + h * du) - contact.compute_force(u - h * du)) / (2 * h)
+    assert np.abs(contact.compute_tangent(u) @ du - change).max() < 1e-5 * np.abs(change).max()
 
 
 @pytest.mark.parametrize(("bonded", "last"), [(True, (2.6e-3, 2e-3)), (False, (1.5e-3,))])
@@ -277,7 +281,7 @@ def test_a_rod_above_c2_raises_p_shear_only_with_c2_on_the_lower_face(coarse):
 def test_the_parts_under_a_rod_sum_to_the_signal_of_the_bench(coarse):
     """The parts know the field without the cube alone; a rod above the middle gives none."""
     bench = VirtualBench(NARROW, size=1.0)
-    signal = P_SHEAR @ bench.pad_weights(bench.layout)
+    signal = P_SHEAR @ bench.compute_pad_weights(bench.layout)
     middle, beside = (make_dent_step(NARROW, Rod(1e-3, place)) for place in (0.0, 2e-3))
     none, parts = (split_signals(bench, step, [signal])[0] for step in (middle, beside))
     assert parts.sum() == pytest.approx(P_SHEAR @ bench.run([beside]).pads[0], rel=1e-6)
@@ -289,7 +293,7 @@ def test_the_parts_sum_to_the_signal_of_a_rod_with_the_force_it_has_without_the_
     bench = VirtualBench(Body(width=12e-3), size=2.0)
     step = make_dent_step(bench.body, Rod(1e-3, 1e-3, edge_radius=1e-5))  # sharp: soon solved
     drawn_back, bottom = draw_back(bench, step), bottom_weights(bench.section.basis, along=1) > 0
-    signal = P_SHEAR @ bench.pad_weights(bench.layout)
+    signal = P_SHEAR @ bench.compute_pad_weights(bench.layout)
     parts = split_signals(bench, step, [signal], "force")[0]
     assert parts.sum() == pytest.approx(P_SHEAR @ bench.run([drawn_back]).pads[0], rel=1e-6)
     force, without = (
@@ -322,7 +326,7 @@ def test_a_field_of_one_order_has_one_part(monkeypatch, part, field):
         return np.where(outside, 1e-4 * np.array(field(*(x / NARROW.side))), np.nan)
 
     bench = VirtualBench(NARROW, size=1.0)
-    parts = split_signals(bench, LoadStep(moved), [bench.pad_weights(bench.layout)[1]])[0]
+    parts = split_signals(bench, LoadStep(moved), [bench.compute_pad_weights(bench.layout)[1]])[0]
     assert np.argmax(np.abs(parts)) == PARTS.index(part)
     others = np.delete(parts, PARTS.index(part))
     assert np.abs(others).max() < 5e-3 * np.abs(parts).max()

@@ -34,7 +34,9 @@ def test_reciprocity_gives_what_a_force_on_the_surface_does(influence):
         dof = top[np.argmin(np.abs(x[0, top] - place))]
         forces = np.zeros((len(c), 1))
         forces[dof] = 1.0
-        direct = fem.pad_stresses(solid, PLANAR, lambda _, f=forces: [f])[:, 0] / (body.side / 2)
+        direct = fem.compute_pad_stresses(solid, PLANAR, lambda _, f=forces: [f])[:, 0] / (
+            body.side / 2
+        )
         node = np.argmin(np.abs(influence.place[:, 0] - x[0, dof] * body.side / 2))
         given = influence.pads[:, node, component]
         assert np.abs(direct - given).max() < 1e-4 * np.abs(influence.pads).max()
@@ -62,7 +64,7 @@ def test_reciprocity_in_space(monkeypatch):
     ]
     forces = np.zeros((len(c), len(dofs)))
     forces[dofs, range(len(dofs))] = 0.5  # half of the body carries half of a force on its mirror
-    direct = fem.pad_stresses(solid, layout, lambda p: [forces * (p[1] > 0)])
+    direct = fem.compute_pad_stresses(solid, layout, lambda p: [forces * (p[1] > 0)])
     for column, dof in zip(direct.T / (body.side / 2) ** 2, dofs, strict=True):
         away = influence.place - x[:2, dof] * body.side / 2
         given = influence.pads[:, np.argmin(np.hypot(*away.T)), c[dof]]

@@ -260,7 +260,7 @@ def test_the_size_of_a_flat_punch_settles():
     off, five stated deviations."""
     bench = TractionBench(Setting(pitch=24e-3, depth=4e-3, shape="flat punch"), side=2)
     random = np.random.default_rng(11)
-    load, centre = bench.load(random)
+    load, centre = bench.draw_load(random)
     (found,) = ContactTracker(bench.inverse, LEAST).update(
         bench.compute_values(10e-3, load, centre, random), max_work=np.inf
     )
