@@ -267,7 +267,7 @@ def _show_volume(result: VolumeResponse) -> None:
     calibration = find_shipped_calibration(result.layout)
     if calibration is None:
         return
-    matrix = Pipeline([calibration]).matrix(0)
+    matrix = Pipeline([calibration]).find_matrix(0)
     for label, pads, unit in cases:
         values = matrix @ pads
         for name, value in zip(COMPONENTS, values.tolist(), strict=True):

@@ -49,7 +49,7 @@ def info_of(
         message(
             "cube_tensor_driver/msg/CubeInfo",
             name=cube.name,
-            frame_id=skin.frame(cube),
+            frame_id=skin.make_frame_id(cube),
             pose=pose,
             link=cube.link or "",
             index=cube.index or 0,
@@ -99,7 +99,7 @@ def stress_of(source: object, pipeline: Pipeline, left_out: np.ndarray) -> objec
     """Message by message, as the node does; left_out: pads that it found stuck."""
     n = len(source.cube)
     rows = pipeline.process(
-        FrequencyRows.of(
+        FrequencyRows.from_values(
             source.cube, source.frequency.reshape(n, -1), temperature=source.temperature
         ),
         left_out,

@@ -282,13 +282,13 @@ def samples(cube, frequency, pad_fault=0, temperature=None) -> FrequencyRows:
     """Rows without a time."""
     known = np.nan if temperature is None else temperature
     fault = 0 if pad_fault is None else pad_fault
-    return FrequencyRows.of(cube, frequency, pad_fault=fault, temperature=known)
+    return FrequencyRows.from_values(cube, frequency, pad_fault=fault, temperature=known)
 
 
 def stamped(cube, frequency, pad_fault, stamp_ns, temperature=None) -> FrequencyRows:
     """Rows with a time."""
     known = np.nan if temperature is None else temperature
-    return FrequencyRows.of(
+    return FrequencyRows.from_values(
         cube, frequency, pad_fault=pad_fault, stamp_ns=stamp_ns, temperature=known
     )
 

@@ -23,7 +23,7 @@ from cube_tensor_design.studies.field_study import compute_field_below
 from cube_tensor_design.studies.traction_study import TractionBench, make_flat_punch
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.defaults import FREQUENCY_NOISE, YOUNGS_MODULUS
-from cube_tensor_driver.core.oscillator import pad_frequency
+from cube_tensor_driver.core.oscillator import compute_pad_frequency
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.mechanics import contact
@@ -114,9 +114,13 @@ class RubbedSkin:
         """Components (scans, cubes, 15) that the pipeline computes from pads (scans, cubes, P)."""
         calibration = self.bench.calibration
         rest = calibration.rest_frequency
-        hertz = pad_frequency(pads * self._gain, rest, calibration.beta, calibration.modulus)
+        hertz = compute_pad_frequency(
+            pads * self._gain, rest, calibration.beta, calibration.modulus
+        )
         hertz *= 1 + FREQUENCY_NOISE * self._random.standard_normal(hertz.shape)
         scans, count, n_pads = hertz.shape
-        rows = FrequencyRows.of(np.tile(np.arange(count), scans), hertz.reshape(-1, n_pads))
+        rows = FrequencyRows.from_values(
+            np.tile(np.arange(count), scans), hertz.reshape(-1, n_pads)
+        )
         found = self._pipeline.process(rows)
         return np.concatenate([found.stress, found.gradient], axis=1).reshape(scans, count, 15)

@@ -24,9 +24,9 @@ from cube_tensor_driver.config.package_data import find_shipped
 from cube_tensor_driver.config.schema import (
     TEXT,
     Schema,
-    list_of,
-    mapping,
-    real,
+    make_list_schema,
+    make_mapping_schema,
+    make_number_schema,
 )
 from cube_tensor_driver.config.yaml import read_yaml
 from cube_tensor_driver.core.calibration import Calibration
@@ -48,18 +48,18 @@ from .body import Body, strip_layout
 DEFAULT_LAYOUT = "planar"
 """Name of the layout (places of the pads) of a model file that names none."""
 
-_NUMBER = real("a number in SI units")
+_NUMBER = make_number_schema("a number in SI units")
 """Schema of any quantity."""
-_POSITIVE = real("a positive number in SI units", exclusiveMinimum=0)
+_POSITIVE = make_number_schema("a positive number in SI units", exclusiveMinimum=0)
 """Schema of a length, modulus or density."""
-_POISSON = real(
+_POISSON = make_number_schema(
     "a number in [0, 0.5), for rubber 0.48 to 0.4999",
     minimum=0,
     exclusiveMaximum=0.5,
 )
 """Schema of Poisson's ratio. The elements do not lock close to 0.5, but at 0.5 pressure is no
 longer a function of strain."""
-_MODES = list_of(TEXT, "names of modes") | {
+_MODES = make_list_schema(TEXT, "names of modes") | {
     "minItems": 0,
     "description": "a list of modes",
 }
@@ -82,7 +82,7 @@ _CUBE = {"side": _POSITIVE, "x": _NUMBER, "z": _NUMBER, **_MATERIAL, "rigid": _R
 _PADS = {"width": _NUMBER, "centre": _NUMBER}
 """Keys of the pads and their schemas, both lengths in m."""
 _SCHEMA = Schema(
-    mapping(
+    make_mapping_schema(
         (),
         {
             "layout": TEXT,
@@ -90,9 +90,9 @@ _SCHEMA = Schema(
             "plane": _PLANE,
             "neglect": _MODES,
             "calibration": TEXT,
-            "body": mapping((), _BODY),
-            "cube": mapping((), _CUBE),
-            "pads": mapping((), _PADS),
+            "body": make_mapping_schema((), _BODY),
+            "cube": make_mapping_schema((), _CUBE),
+            "pads": make_mapping_schema((), _PADS),
         },
     )
 )
@@ -163,7 +163,7 @@ def _build_model(data: Mapping[str, Any], folder: Path) -> Model:
     neglect = tuple(data.get("neglect", ()))
     # Both calls raise an error for a name that does not fit the layout, before any work.
     find_structure(layout, symmetry)
-    choose_default_modes(layout).index(neglect)
+    choose_default_modes(layout).find_indices(neglect)
     calibration = find_shipped_calibration(layout)
     if "calibration" in data:
         calibration = read_calibration(find_calibration(data["calibration"], folder))

@@ -22,7 +22,7 @@ from cube_tensor_driver.core.defaults import BETA, REST_FREQUENCY
 from cube_tensor_driver.core.estimator import estimate_modes
 from cube_tensor_driver.core.layout import LAYOUTS, Layout
 from cube_tensor_driver.core.modes import PLANE
-from cube_tensor_driver.core.oscillator import pad_frequency
+from cube_tensor_driver.core.oscillator import compute_pad_frequency
 
 from ..fem.body import Body
 from ..fem.fem import Progress, compute_response, count_steps
@@ -146,7 +146,7 @@ def _take_first_half(experiment: Experiment, name: str) -> Experiment:
 def compute_foam_frequency(pads: Array) -> Array:
     """Return the frequencies in Hz of pads under a stress in Pa, by the pad law."""
     rest, beta, modulus = np.array([REST_FREQUENCY, BETA, FOAM_MODULUS])
-    return pad_frequency(pads, rest, beta, modulus)
+    return compute_pad_frequency(pads, rest, beta, modulus)
 
 
 def compute_prototype_signals(frequency: Array) -> Array:

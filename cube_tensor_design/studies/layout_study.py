@@ -219,7 +219,7 @@ def _compute_recovery_matrix(matrix: Array, name: str) -> Array:
     modes = PLANE if layout.planar else SPACE
     # A layout in a plane has plane modes only. `states` has the amplitudes of the modes in space
     # that each mode of the layout stands for.
-    states = SPACE.state(modes.stress, modes.gradient).T
+    states = SPACE.compute_state(modes.stress, modes.gradient).T
     response = matrix[: layout.n_pads] @ states
     noise = np.ones(layout.n_pads)
     return make_estimator(response, noise, modes, neglect=NEGLECTED_MODES[name]).matrix

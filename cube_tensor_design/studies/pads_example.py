@@ -99,7 +99,7 @@ def sweep(points: int = 129) -> Sweep:
     gradient = passing[:, 6:].reshape(points, 6, 3)
     pads = compute_true_state(calibration, passing[:, :6], gradient) @ calibration.response.T
 
-    to_components = Pipeline([calibration]).matrix(0)
+    to_components = Pipeline([calibration]).find_matrix(0)
     left, right = (calibration.layout.pads.index(name) for name in PAIR)
     # The difference of the two pads counts as shear, with the gain of uniform shear.
     to_shear = calibration.response[:, calibration.modes.names.index("zx")]

@@ -28,7 +28,7 @@ from cube_tensor_driver.core.defaults import (
     POISSONS_RATIO,
 )
 from cube_tensor_driver.core.modes import to_gradient_tensor
-from cube_tensor_driver.core.oscillator import pad_frequency
+from cube_tensor_driver.core.oscillator import compute_pad_frequency
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.rows import FrequencyRows
@@ -278,7 +278,7 @@ class TractionBench:
         stress = rotate_stress(field[:, :6], to_cube)
         gradient = to_gradient_tensor(field[:, 6:].reshape(-1, 6, 3))
         gradient = rotate_gradient(gradient, to_cube)
-        state = calibration.modes.state(stress, calibration.half_side * gradient)
+        state = calibration.modes.compute_state(stress, calibration.half_side * gradient)
         return state @ calibration.response.T
 
     def measure(
@@ -298,14 +298,14 @@ class TractionBench:
         gain = 1 + self.setting.gain_error * random.standard_normal(pads.shape)
         pads = pads * gain
         rest = calibration.rest_frequency
-        frequency = pad_frequency(
+        frequency = compute_pad_frequency(
             pads,
             rest,
             calibration.beta,
             calibration.modulus,
         )
         frequency *= 1 + FREQUENCY_NOISE * random.standard_normal(frequency.shape)
-        rows = FrequencyRows.of(np.arange(len(frequency)), frequency)
+        rows = FrequencyRows.from_values(np.arange(len(frequency)), frequency)
         result = self._pipeline.process(rows, left_out)
         return np.concatenate([result.stress, result.gradient], axis=1)
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..config.skin import Skin, SkinCube, SkinLink
-from ..core.arrays import Array, Index, Times, pad_table
+from ..core.arrays import Array, Index, Times, stack_pad_table
 from ..core.calibration import Calibration
 from ..core.errors import BagError, CubeError, MessageError
 from ..core.reconstructor import Reconstructor, RecordedHealth
@@ -216,7 +216,7 @@ def read_settings(info: SkinInfo) -> Settings:
             )
         rest.append(frequency)
     widest = max(map(len, rest))
-    return Settings(calibrations, pad_table(rest, widest, np.nan))
+    return Settings(calibrations, stack_pad_table(rest, widest, np.nan))
 
 
 def make_recorded_skin(

@@ -16,7 +16,7 @@ import viser
 
 from ..core.arrays import AnyArray, Array
 from ..core.latest_stress import DOUBTFUL, FAULTY, STALE
-from ..core.poses import CubePoses, quaternions
+from ..core.poses import CubePoses, compute_quaternions
 from ..touch.surface import Contact, Surface
 from ..views import scene
 from ..views.meshes import (
@@ -503,7 +503,7 @@ class Scene:
         return api.add_batched_meshes_simple(
             "/cubes",
             *make_cube(),
-            quaternions(poses.rotation),
+            compute_quaternions(poses.rotation),
             poses.position,
             batched_scales=poses.half_side,
             batched_colors=np.full_like(poses.position, 200, np.uint8),

@@ -288,9 +288,9 @@ class Viewer:
         scans = self._scans
         has_advanced = scans.advance()
         stale_s = NEVER_STALE_S if self._replay.is_held else STALE_S
-        health = scans.latest.health(self._subscriber.now(), stale_s)
+        health = scans.latest.compute_health(self._subscriber.now(), stale_s)
         if has_advanced:
-            values = scans.latest.usable_values(health)
+            values = scans.latest.select_usable_values(health)
             self._history.add(
                 1e-9 * scans.stamp_ns,
                 values,
@@ -348,7 +348,7 @@ def make_scan(
         links: Line of text and level of the diagnostics of each link (connection to a hub).
     """
     latest = scans.latest
-    values = latest.usable_values(health)
+    values = latest.select_usable_values(health)
     contacts = scans.contacts
     if contacts is None:
         contacts = skin.surface.contacts(values, CONTACT_PRESSURE)

@@ -67,7 +67,7 @@ class BlockMeans:
                     continue
                 # The stresses of all pads are computed, even of those that the device reports as
                 # broken, because every block must have the same pads.
-                stress = pipeline.pad_stress(rows, np.zeros_like(rows.pad_fault))
+                stress = pipeline.compute_pad_stress(rows, np.zeros_like(rows.pad_fault))
                 values = np.column_stack([np.nan_to_num(stress), known])
                 block = (rows.stamp_ns - start_ns) // block_ns
                 is_within = (block >= 0) & (block < shape[1])

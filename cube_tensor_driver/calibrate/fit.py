@@ -30,7 +30,7 @@ from ..core.arrays import Array, Mask, Real
 from ..core.calibration import Calibration
 from ..core.errors import FitError
 from ..core.modes import Modes
-from ..core.oscillator import pad_stress
+from ..core.oscillator import compute_pad_stress
 from ..core.symmetry import Structure
 from .robust import (
     MAX_STEPS,
@@ -153,8 +153,8 @@ def measured_stress(
         )
     rest = base.rest_frequency
     if base.temperature is not None and temperature is not None:
-        rest = rest * base.temperature.factor(temperature)
-    v = pad_stress(f, rest, base.beta, base.modulus)
+        rest = rest * base.temperature.compute_factor(temperature)
+    v = compute_pad_stress(f, rest, base.beta, base.modulus)
     invalid = np.argwhere(~np.isfinite(v))
     for load, pad in invalid.tolist():
         raise FitError(
@@ -191,7 +191,7 @@ def loads_from_forces(
     stress = np.zeros((len(force), 6))
     zx_yz_zz = [4, 3, 2]
     stress[:, zx_yz_zz] = force / area
-    return modes.state(stress)
+    return modes.compute_state(stress)
 
 
 def fit(

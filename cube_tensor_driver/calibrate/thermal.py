@@ -157,7 +157,7 @@ class ThermalFit:
             base: Calibration with which the stresses were computed.
             source: Text that states the origin of the values.
         """
-        rest = pad_frequency(
+        rest = compute_pad_frequency(
             self.offset,
             base.rest_frequency,
             base.beta,

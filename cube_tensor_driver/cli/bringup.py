@@ -245,7 +245,7 @@ def press_cubes(source: LinkSource, rest: PadsAtRest) -> dict[int, Explanation]:
         explain_presses,
         list_cube_rotations,
     )
-    from ..core.oscillator import pad_stress
+    from ..core.oscillator import compute_pad_stress
     from ..views.terminal.output import say
 
     cubes = source.skin.cubes
@@ -284,7 +284,7 @@ def press_cubes(source: LinkSource, rest: PadsAtRest) -> dict[int, Explanation]:
             presses.append(wait_for_press({cube}, f"{cubes[cube].name} on its {side} side"))
         # The pad law (docs/physics.md) converts relative changes of frequency into pad stresses.
         ratio = 1 + np.array([each.change for each in presses])
-        measured = pad_stress(
+        measured = compute_pad_stress(
             ratio,
             1.0,
             calibration.beta,

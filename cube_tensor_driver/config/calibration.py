@@ -93,7 +93,7 @@ def find_shipped_calibration(layout: Layout) -> Calibration | None:
     """
     # A layout that was read from a file may have the name of a built-in one but other pads.
     built_in = LAYOUTS.get(layout.name)
-    if built_in is None or not built_in.same_as(layout):
+    if built_in is None or not built_in.has_same_pads(layout):
         return None
     path = find_package_data() / "config" / "calibration" / f"{layout.name}.yaml"
     # Which modes may be neglected depends on the application, so the user states it in his own

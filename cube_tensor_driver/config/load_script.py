@@ -18,7 +18,16 @@ import numpy as np
 from ..core.arrays import Array
 from ..core.defaults import POISSONS_RATIO, SURFACE_DEPTH, YOUNGS_MODULUS
 from ..core.errors import ConfigError
-from .schema import NAME, TRIPLE, JsonSchema, Schema, integer, list_of, mapping, real
+from .schema import (
+    NAME,
+    TRIPLE,
+    JsonSchema,
+    Schema,
+    make_integer_schema,
+    make_list_schema,
+    make_mapping_schema,
+    make_number_schema,
+)
 from .yaml import read_yaml
 
 MAX_TAPS = 1000
@@ -32,9 +41,9 @@ FRICTION_SAMPLES = 1001
 """Number of equidistant instants of an action at which the tangential force is compared with the
 limit of friction (coefficient of friction times normal force)."""
 
-_TIME = real("a time in s from 0 up", minimum=0)
+_TIME = make_number_schema("a time in s from 0 up", minimum=0)
 """Schema of a time, in s after the start of the load script."""
-_PEAK_FORCE = real("a force in N greater than 0", exclusiveMinimum=0)
+_PEAK_FORCE = make_number_schema("a force in N greater than 0", exclusiveMinimum=0)
 """Schema of the largest normal force of a tap."""
 _FORCE: JsonSchema = {
     "anyOf": [
@@ -64,9 +73,9 @@ _SHEAR: JsonSchema = {
 """Schema of an indenter's tangential force: its value at the largest normal force, or values at
 equal intervals during the action. With a single value, the tangential force is proportional to the
 normal force."""
-_TIMES = integer(1, MAX_TAPS, f"an integer from 1 to {MAX_TAPS}")
+_TIMES = make_integer_schema(1, MAX_TAPS, f"an integer from 1 to {MAX_TAPS}")
 """Schema of the number of taps of one action."""
-_PATH = list_of(TRIPLE, "positions [x, y, z]", 2)
+_PATH = make_list_schema(TRIPLE, "positions [x, y, z]", 2)
 """Schema of the positions on the surface along which an indenter moves."""
 
 
@@ -82,7 +91,7 @@ def _make_action_schema(optional: JsonSchema, **required: JsonSchema) -> JsonSch
         "to": _TIME,
         **required,
     }
-    return mapping(needed, needed | optional)
+    return make_mapping_schema(needed, needed | optional)
 
 
 _ACTIONS: JsonSchema = {
@@ -92,34 +101,34 @@ _ACTIONS: JsonSchema = {
     "tap": _make_action_schema({"times": _TIMES}, at=TRIPLE, force=_PEAK_FORCE),
 }
 """Kind of an indenter's action (press, slide, roll or tap) -> schema of the keys of the action."""
-_ACTION = mapping((), _ACTIONS) | {
+_ACTION = make_mapping_schema((), _ACTIONS) | {
     "minProperties": 1,
     "maxProperties": 1,
     "description": f"one of {', '.join(_ACTIONS)}",
 }
 """Schema of an action. In YAML it is a mapping with a single key, its kind: {press: {from: 0, to:
 1, ...}}."""
-_INDENTER = mapping(
+_INDENTER = make_mapping_schema(
     ("name", "shape", "radius", "does"),
     {
         "name": NAME,
         "shape": {"enum": ["disc", "sphere"], "description": "disc or sphere"},
-        "radius": real("a number greater than 0, m", exclusiveMinimum=0),
-        "friction": real("a number from 0 up", minimum=0),
-        "does": list_of(_ACTION, "actions"),
+        "radius": make_number_schema("a number greater than 0, m", exclusiveMinimum=0),
+        "friction": make_number_schema("a number from 0 up", minimum=0),
+        "does": make_list_schema(_ACTION, "actions"),
     },
 )
 """Schema of an indenter and the list of its actions."""
 _SCHEMA = Schema(
-    mapping(
+    make_mapping_schema(
         ("indenters",),
         {
-            "period": real("a number greater than 0, s", exclusiveMinimum=0),
-            "depth": real("a number greater than 0, m", exclusiveMinimum=0),
-            "young": real("a number greater than 0, Pa", exclusiveMinimum=0),
-            "poisson": real("-1 < poisson <= 0.5", exclusiveMinimum=-1, maximum=0.5),
+            "period": make_number_schema("a number greater than 0, s", exclusiveMinimum=0),
+            "depth": make_number_schema("a number greater than 0, m", exclusiveMinimum=0),
+            "young": make_number_schema("a number greater than 0, Pa", exclusiveMinimum=0),
+            "poisson": make_number_schema("-1 < poisson <= 0.5", exclusiveMinimum=-1, maximum=0.5),
             "places": {"enum": ["m", "skin"], "description": "m or skin"},
-            "indenters": list_of(_INDENTER, "indenters"),
+            "indenters": make_list_schema(_INDENTER, "indenters"),
         },
     )
 )

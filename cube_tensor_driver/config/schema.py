@@ -54,7 +54,7 @@ _NUMBER_WORDS = {1: "one", 2: "two"}
 """Words for small numbers in error messages."""
 
 
-def mapping(required: Iterable[str], properties: Mapping[str, object]) -> JsonSchema:
+def make_mapping_schema(required: Iterable[str], properties: Mapping[str, object]) -> JsonSchema:
     """Return the JSON schema of a mapping.
 
     Args:
@@ -70,7 +70,7 @@ def mapping(required: Iterable[str], properties: Mapping[str, object]) -> JsonSc
     }
 
 
-def list_of(item: JsonSchema, what: str, minimum: int = 1) -> JsonSchema:
+def make_list_schema(item: JsonSchema, what: str, minimum: int = 1) -> JsonSchema:
     """Return the schema of a list.
 
     Args:
@@ -86,7 +86,7 @@ def list_of(item: JsonSchema, what: str, minimum: int = 1) -> JsonSchema:
     }
 
 
-def real(description: str, **limits: float) -> JsonSchema:
+def make_number_schema(description: str, **limits: float) -> JsonSchema:
     """Return the JSON schema of a number.
 
     Args:
@@ -100,7 +100,7 @@ def real(description: str, **limits: float) -> JsonSchema:
     }
 
 
-def integer(minimum: int, maximum: int, description: str) -> JsonSchema:
+def make_integer_schema(minimum: int, maximum: int, description: str) -> JsonSchema:
     """Return the JSON schema of an integer from `minimum` to `maximum`, both included.
 
     Args:

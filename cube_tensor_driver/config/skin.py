@@ -23,7 +23,17 @@ from ..core.poses import CubePoses
 from ..core.tensor import rotation_from_rpy
 from .calibration import find_calibration, read_calibration
 from .port import find_port_problem
-from .schema import NAME, TEXT, TRIPLE, JsonSchema, Schema, integer, list_of, mapping, real
+from .schema import (
+    NAME,
+    TEXT,
+    TRIPLE,
+    JsonSchema,
+    Schema,
+    make_integer_schema,
+    make_list_schema,
+    make_mapping_schema,
+    make_number_schema,
+)
 from .yaml import read_yaml
 
 BAUD = 921_600
@@ -48,11 +58,11 @@ _UID: JsonSchema = {
 }
 """Schema of a uid (unique number) of a cube or hub. A text such as 0x1f is accepted, too, because
 the labels on cubes show the uid in hexadecimal."""
-_INDEX = integer(0, 65535, "an integer from 0 to 65535")
+_INDEX = make_integer_schema(0, 65535, "an integer from 0 to 65535")
 """Schema of the index of a cube on its hub, which has 16 bits in the protocol."""
-_BAUD = integer(1200, 20_000_000, "1200 to 20000000")
+_BAUD = make_integer_schema(1200, 20_000_000, "1200 to 20000000")
 """Schema of a baud rate, in bits per second."""
-_LINK = mapping(
+_LINK = make_mapping_schema(
     ("name", "port"),
     {
         "name": NAME,
@@ -70,39 +80,41 @@ _CUBE_ADDRESS: JsonSchema = {
 """Schema of the keys by which a cube is found: its uid, or its link and its index on the hub. A uid
 and an index together are refused, because they might contradict each other after the cube is
 replaced. With a uid, the link may be left out."""
-_CUBE = mapping(
+_CUBE = make_mapping_schema(
     ("name", "pose", "layout", "calibration"),
     {
         "name": NAME,
         "link": NAME,
         "index": _INDEX,
         "uid": _UID,
-        "pose": mapping(("xyz", "rpy"), {"xyz": TRIPLE, "rpy": TRIPLE}),
+        "pose": make_mapping_schema(("xyz", "rpy"), {"xyz": TRIPLE, "rpy": TRIPLE}),
         "layout": TEXT,
         "calibration": TEXT,
     },
 ) | {"allOf": [_CUBE_ADDRESS]}
 """Schema of a cube."""
-_ELASTOMER = mapping(
+_ELASTOMER = make_mapping_schema(
     ("depth", "thickness"),
     {
-        "depth": real("m, greater than 0", exclusiveMinimum=0),
-        "thickness": real("m, 0 or greater (0: a half space)", minimum=0),
-        "poisson": real("0 to 0.5", minimum=0, maximum=0.5),
+        "depth": make_number_schema("m, greater than 0", exclusiveMinimum=0),
+        "thickness": make_number_schema("m, 0 or greater (0: a half space)", minimum=0),
+        "poisson": make_number_schema("0 to 0.5", minimum=0, maximum=0.5),
     },
 )
 """Schema of the elastomer in which the cubes are embedded: depth of their centres, thickness of the
 layer, and Poisson's ratio."""
 _SCHEMA = Schema(
-    mapping(
+    make_mapping_schema(
         ("name", "parent_frame", "links", "cubes"),
         {
             "name": NAME,
             "parent_frame": _FRAME,
-            "rate": real("samples per second, 0.1 to 10000", minimum=0.1, maximum=10_000),
+            "rate": make_number_schema(
+                "samples per second, 0.1 to 10000", minimum=0.1, maximum=10_000
+            ),
             "elastomer": _ELASTOMER,
-            "links": list_of(_LINK, "links"),
-            "cubes": list_of(_CUBE, "cubes"),
+            "links": make_list_schema(_LINK, "links"),
+            "cubes": make_list_schema(_CUBE, "cubes"),
         },
     )
 )
@@ -257,7 +269,7 @@ class Skin:
         """Largest number of pads of a cube, which is the number of columns of frequency arrays."""
         return max(calibration.layout.n_pads for calibration in self.calibrations)
 
-    def frame(self, cube: SkinCube) -> str:
+    def make_frame_id(self, cube: SkinCube) -> str:
         """Return the frame id of a cube: the frame prefix, and the names of skin and cube, joined
         by an underscore."""
         return f"{self.frame_prefix}{self.name}_{cube.name}"

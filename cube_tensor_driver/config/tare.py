@@ -18,7 +18,7 @@ from ..core.arrays import Array, Real
 from ..core.calibration import Calibration
 from ..core.errors import ConfigError
 from ..core.health.tare import MAX_REST_CHANGE
-from .schema import TEXT, JsonSchema, Schema, mapping
+from .schema import TEXT, JsonSchema, Schema, make_mapping_schema
 from .yaml import read_yaml, write_yaml
 
 SCHEMA_VERSION = 1
@@ -42,13 +42,13 @@ class StoredTare(NamedTuple):
 
 
 class _TareContent(TypedDict):
-    """Keys of a tare file that `StoredTare` contains, see `_tare_schema`."""
+    """Keys of a tare file that `StoredTare` contains, see `_make_tare_schema`."""
 
     rest_frequency: list[float]
     created: str
 
 
-def tare_path(folder: Path, uid: int) -> Path:
+def find_tare_path(folder: Path, uid: int) -> Path:
     """Return the path of the tare file (frequencies without load) of the cube with this uid."""
     return folder / f"{uid:016x}.yaml"
 
@@ -86,7 +86,7 @@ def write_tare(
         "created": created.isoformat(timespec="seconds"),
         "rest_frequency": [float(value) for value in rest_frequency],
     }
-    write_yaml(tare_path(folder, uid), content, _HEADER)
+    write_yaml(find_tare_path(folder, uid), content, _HEADER)
 
 
 def read_tare(
@@ -106,11 +106,11 @@ def read_tare(
             calibration, or has frequencies that the tare service would refuse. The message states
             which of these it is, and asks for a new tare.
     """
-    path = tare_path(folder, uid)
+    path = find_tare_path(folder, uid)
     if not path.exists():
         return None
     content = read_yaml(path)
-    for _, mistake in _tare_schema(uid, calibration).find_mistakes(content):
+    for _, mistake in _make_tare_schema(uid, calibration).find_mistakes(content):
         raise ConfigError(f"{path}: {mistake}; tare again")
     # The schema has checked the types of all values.
     data = cast("_TareContent", content)
@@ -132,7 +132,7 @@ def remove_tare(folder: Path, uid: int) -> None:
     Raises:
         ConfigError: The file cannot be removed.
     """
-    path = tare_path(folder, uid)
+    path = find_tare_path(folder, uid)
     try:
         # A missing file is no error, so that clearing a tare twice succeeds.
         path.unlink(missing_ok=True)
@@ -140,7 +140,7 @@ def remove_tare(folder: Path, uid: int) -> None:
         raise ConfigError(f"{path}: {error.strerror}; remove it by hand") from None
 
 
-def _tare_schema(uid: int, calibration: Calibration) -> Schema:
+def _make_tare_schema(uid: int, calibration: Calibration) -> Schema:
     """Return the schema of the tare file of a cube.
 
     The uid in the content differs from that of the cube if somebody has renamed the file, or copied
@@ -177,4 +177,4 @@ def _tare_schema(uid: int, calibration: Calibration) -> Schema:
             "description": f"{n_pads} numbers",
         },
     }
-    return Schema(mapping(properties, properties))
+    return Schema(make_mapping_schema(properties, properties))

@@ -48,7 +48,7 @@ def make_skin_urdf(skin: Skin) -> str:
     cubes = [
         _CUBE.format(
             name=skin.name,
-            frame=skin.frame(cube),
+            frame=skin.make_frame_id(cube),
             parent=skin.parent_frame,
             side=2 * cube.calibration.half_side,
             xyz=_format(cube.xyz),

@@ -13,14 +13,14 @@ from functools import cached_property
 import numpy as np
 
 from .arguments import read_numbers
-from .arrays import Array, pad_table
+from .arrays import Array, stack_pad_table
 from .compensation.models import CreepModel, EffectModel, ThermalModel, WeightModel
 from .defaults import BETA, FOAM_MODULUS, FREQUENCY_NOISE, HALF_SIDE, REST_FREQUENCY
 from .errors import CalibrationError, LayoutError, SymmetryError
 from .layout import LAYOUTS, Layout, find_layout
 from .modes import COMPONENTS, STRESS, Modes
 from .oscillator import TemperatureModel
-from .response import choose_illustrative_coefficients, response
+from .response import choose_illustrative_coefficients, compute_response
 from .symmetry import Structure, choose_default_modes, find_largest_symmetry, find_structure
 
 SCHEMA = 1
@@ -120,7 +120,7 @@ class Calibration:
                 )
         try:
             structure = self.structure
-            self.modes.index(self.neglect)
+            self.modes.find_indices(self.neglect)
         except (LayoutError, SymmetryError) as error:
             raise CalibrationError(f"calibration: {error}") from error
         self._set("neglect", tuple(self.neglect))
@@ -179,7 +179,7 @@ class Calibration:
             )
         if self.coefficients is not None:
             coefficients = _read_coefficients(self.coefficients)
-            response(structure, coefficients)  # raises an error if they do not fit
+            compute_response(structure, coefficients)  # raises an error if they do not fit
             ordered = {name: coefficients[name] for name in structure.names}
             self._set("coefficients", ordered)
         else:
@@ -244,7 +244,7 @@ class Calibration:
         modes.
         """
         if self.coefficients is not None:
-            matrix = response(self.structure, self.coefficients)
+            matrix = compute_response(self.structure, self.coefficients)
         else:
             matrix = np.asarray(self.matrix)
         result: Array = self.gain[:, None] * matrix
@@ -291,7 +291,7 @@ class Calibration:
         Raises:
             CalibrationError: The calibration was made for another layout or another cube.
         """
-        if layout is not None and not self.layout.same_as(layout):
+        if layout is not None and not self.layout.has_same_pads(layout):
             raise CalibrationError(
                 f"calibration {self.id} is for layout {self.layout.name!r} "
                 f"({self.layout.n_pads} pads), the cube has layout {layout.name!r} "
@@ -310,7 +310,7 @@ class Calibration:
     def _make_content(self) -> dict[str, object]:
         """Return all attributes that have a value, in types that JSON has, without the id."""
         built_in = LAYOUTS.get(self.layout.name)
-        is_built_in = built_in is not None and built_in.same_as(self.layout)
+        is_built_in = built_in is not None and built_in.has_same_pads(self.layout)
         # The name of a built-in layout is enough to find its pads, and keeps files short.
         content: dict[str, object] = {
             "schema": SCHEMA,
@@ -387,10 +387,10 @@ def tabulate_pads(
         fill: Value of the entries for pads that a cube does not have.
     """
     values = [getattr(calibration, name) for calibration in calibrations]
-    return pad_table(values, n_pads, fill)
+    return stack_pad_table(values, n_pads, fill)
 
 
-def illustrative(
+def make_illustrative_calibration(
     layout_name: str,
     neglect: Sequence[str] = (),
     uid: int | None = None,

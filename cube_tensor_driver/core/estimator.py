@@ -103,7 +103,7 @@ class Estimator:
         """Number D of degrees of freedom of chi-square."""
         return len(self.null)
 
-    def suspects(self, pad_stress: Array) -> Mask:
+    def find_suspects(self, pad_stress: Array) -> Mask:
         """Find each pad that, as the only broken pad of a cube, would explain a high chi-square.
 
         Leaving out pad p lowers chi-square by (u_p . z)^2 / |u_p|^2. Here z = `null` v are the
@@ -141,7 +141,7 @@ class Estimator:
         is_similar = drop > best[:, None] - SUSPECT_MARGIN
         # After leaving out the broken pad, chi-square is that of noise alone, with one degree of
         # freedom less because there is one pad less.
-        limit_without = chi2_limit(self.dof - 1)
+        limit_without = compute_chi2_limit(self.dof - 1)
         is_explained = (chi2 > self.limit) & (chi2 - best < limit_without)
         is_specific = is_similar.sum(axis=1) < is_checked.sum()
         has_suspects = is_explained & is_specific
@@ -179,7 +179,7 @@ def make_estimator(
     all_pads = np.arange(n_pads)
     all_modes = np.arange(modes.n_modes)
     present = np.setdiff1d(all_pads, np.asarray(missing, dtype=int))
-    kept = np.setdiff1d(all_modes, modes.index(neglect))
+    kept = np.setdiff1d(all_modes, modes.find_indices(neglect))
 
     # The stresses on the pads divided by the noise (standard deviation) of each pad, and multiplied
     # by the matrix D (`decorrelate`), are uncorrelated and have the standard deviation 1, so that
@@ -234,7 +234,7 @@ def make_estimator(
         observed=observed,
         covariance=covariance,
         null=null,
-        limit=chi2_limit(len(null)),
+        limit=compute_chi2_limit(len(null)),
         rank=rank,
         noise=noise,
     )
@@ -386,7 +386,7 @@ def _find_rank(columns: Array) -> tuple[int, float | None]:
     return len(s), condition
 
 
-def chi2_tail(x: float, dof: int) -> float:
+def compute_chi2_tail(x: float, dof: int) -> float:
     """Compute the probability that chi-square of `dof` degrees of freedom exceeds x.
 
     It is the regularised upper incomplete gamma function Q(dof/2, x/2), which follows from
@@ -412,7 +412,7 @@ def chi2_tail(x: float, dof: int) -> float:
 
 
 @lru_cache
-def chi2_limit(dof: int) -> float:
+def compute_chi2_limit(dof: int) -> float:
     """Compute the value that chi-square exceeds with the probability `FALSE_ALARM`.
 
     Args:
@@ -425,12 +425,12 @@ def chi2_limit(dof: int) -> float:
         return math.nan
     low = 0.0
     high = 1.0
-    while chi2_tail(high, dof) > FALSE_ALARM:
+    while compute_chi2_tail(high, dof) > FALSE_ALARM:
         high *= 2
     # Each bisection halves the interval, and a float has 53 bits of precision.
     for _ in range(60):
         centre = (low + high) / 2
-        if chi2_tail(centre, dof) > FALSE_ALARM:
+        if compute_chi2_tail(centre, dof) > FALSE_ALARM:
             low = centre
         else:
             high = centre

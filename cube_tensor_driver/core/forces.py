@@ -13,7 +13,7 @@ from .arguments import check_number, check_skin
 from .arrays import Array
 from .poses import CubePoses
 from .rows import StressRows
-from .tensor import TRACTION_COMPONENTS, face_force
+from .tensor import TRACTION_COMPONENTS, compute_face_force
 
 
 class PlacedSkin(Protocol):
@@ -82,16 +82,16 @@ class Forces:
         """
         side = self.side[rows.cube, None]
         rotation = self._rotation[rows.cube]
-        in_cube_frame = face_force(rows.stress, side)
+        in_cube_frame = compute_face_force(rows.stress, side)
         force: Array = np.einsum("nij,nj->ni", rotation, in_cube_frame)
         traction = rows.stress[:, TRACTION_COMPONENTS]
-        # `face_force` counts unknown components of the traction as 0. If all three are unknown, a
+        # `compute_face_force` counts unknown components of the traction as 0. If all three are unknown, a
         # force of 0 would claim that nothing presses.
         is_unobserved = np.isnan(traction).all(axis=1)
         force[is_unobserved] = np.nan
         return force
 
-    def of_skin(self, rows: StressRows) -> Array:
+    def compute_in_parent_frame(self, rows: StressRows) -> Array:
         """Return the force at each cube (cubes, 3), in N, in the parent frame of the skin.
 
         Args:

@@ -89,7 +89,7 @@ class LatestStress:
         is_over_limit = rows.status & RESIDUAL != 0
         np.add.at(self._over_limit, cube[is_over_limit], 1)
 
-    def health(self, now: float, stale_after: float) -> Index:
+    def compute_health(self, now: float, stale_after: float) -> Index:
         """Return the health of each cube.
 
         Args:
@@ -110,11 +110,11 @@ class LatestStress:
         health[is_stale] = STALE
         return health
 
-    def usable_values(self, health: Index) -> Array:
+    def select_usable_values(self, health: Index) -> Array:
         """Return the latest components (N, 15), in Pa and Pa/m.
 
         Args:
-            health: Health of the cubes (N,), as `health` returns it. Cubes that are `FAULTY` or
+            health: Health of the cubes (N,), as `compute_health` returns it. Cubes that are `FAULTY` or
                 `STALE` get NaN.
         """
         is_usable: Mask = health < FAULTY

@@ -179,7 +179,7 @@ class Layout:
         is_tilted = np.any(self.normals[:, 1])
         return not (is_off_plane or is_tilted)
 
-    def same_as(self, other: Layout) -> bool:
+    def has_same_pads(self, other: Layout) -> bool:
         """Return whether both layouts have the same pads in the same order."""
         return (
             self.positions.shape == other.positions.shape

@@ -140,7 +140,7 @@ class Modes:
             row /= row.sum()
         return rows @ self.fields
 
-    def state(self, stress: Array, gradient: Array | None = None) -> Array:
+    def compute_state(self, stress: Array, gradient: Array | None = None) -> Array:
         """Compute the states (amplitudes of the modes) of given stress fields.
 
         A part of a field that no mode expresses is ignored: one that violates equilibrium or, for
@@ -166,7 +166,7 @@ class Modes:
         state: Array = fields @ self.reading.T
         return state
 
-    def action(self, rotation: Array) -> Array:
+    def compute_action(self, rotation: Array) -> Array:
         """Compute the matrix that transforms states when the field is rotated or mirrored.
 
         The field transforms as S'_ij = R_ia R_jb S_ab and G'_ijk = R_ia R_jb R_kc G_abc.
@@ -198,7 +198,7 @@ class Modes:
             )
         return action
 
-    def index(self, names: Sequence[str]) -> list[int]:
+    def find_indices(self, names: Sequence[str]) -> list[int]:
         """Return the numbers (from 0) of the modes with these names.
 
         Raises:

@@ -32,7 +32,7 @@ from .arrays import Array, Real
 from .compensation.models import EffectModel
 
 
-def pad_stress(
+def compute_pad_stress(
     frequency: ArrayLike,
     rest_frequency: ArrayLike,
     beta: Real,
@@ -64,13 +64,13 @@ def pad_stress(
         return np.where(is_possible, v, np.nan)
 
 
-def pad_frequency(
+def compute_pad_frequency(
     stress: ArrayLike,
     rest_frequency: Real,
     beta: Real,
     modulus: Real,
 ) -> Array:
-    """Compute the frequencies of pads, in Hz, from their stresses; the inverse of `pad_stress`.
+    """Compute the frequencies of pads, in Hz, from their stresses; the inverse of `compute_pad_stress`.
 
     Args:
         stress: Normal stress on a pad, in Pa, tension positive.
@@ -106,7 +106,7 @@ def find_highest_frequency(rest_frequency: ArrayLike, beta: ArrayLike) -> Array:
         return highest
 
 
-def rest_ratio(coefficients: Array, change: Array) -> Array:
+def compute_rest_ratio(coefficients: Array, change: Array) -> Array:
     """Compute the ratio 1 + sum_d c_d t^d of the rest frequencies of pads at two temperatures.
 
     Horner's scheme needs no powers, whose last bits depend on the processor.
@@ -140,8 +140,8 @@ class TemperatureModel(EffectModel):
     reference: Array
     coefficients: Array
 
-    def factor(self, temperature: ArrayLike) -> Array:
+    def compute_factor(self, temperature: ArrayLike) -> Array:
         """Compute the ratio (N, P) of the rest frequencies at temperatures T (N,), in °C, to those
         at the reference temperature."""
         change = np.asarray(temperature, dtype=float) - self.reference
-        return rest_ratio(self.coefficients.T, change)
+        return compute_rest_ratio(self.coefficients.T, change)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from .arrays import Array, Index, Mask, PadMasks, Real
 from .calibration import Calibration, tabulate_pads
 from .errors import CalibrationError, CubeError, LayoutError
-from .estimator import Estimator, chi2_limit, make_estimator
+from .estimator import Estimator, compute_chi2_limit, make_estimator
 from .kernel.contract import (
     BLOCK,
     DONE,
@@ -43,8 +43,8 @@ from .kernel.rows import (
     apply_law,
     compute_temperature_factor,
     find_existing,
-    mask_bits,
     pack_bits,
+    unpack_mask_bits,
 )
 from .kernel.run import run
 from .modes import GRADIENT, STRESS
@@ -268,7 +268,7 @@ class Pipeline:
         shifted: Array = factor * numerator / (1 + offset)
         return shifted
 
-    def shift_of_zero(self, before: Array) -> Array:
+    def compute_zero_shift(self, before: Array) -> Array:
         """Return by how much stresses were too high because of older rest frequencies (cubes, P).
 
         The rest frequency of a pad is its frequency without load. The result is the stress,
@@ -366,7 +366,7 @@ class Pipeline:
             left_out=np.empty(n, np.uint32),
         )
 
-    def pad_stress(
+    def compute_pad_stress(
         self,
         rows: FrequencyRows,
         left_out: PadMasks | None = None,
@@ -384,7 +384,7 @@ class Pipeline:
         _, is_used, stress = self._apply_law(rows, left_out)
         return np.where(is_used, stress, np.nan)
 
-    def suspects(
+    def find_suspects(
         self,
         rows: FrequencyRows,
         left_out: PadMasks | None = None,
@@ -397,7 +397,7 @@ class Pipeline:
                 the device reports as broken.
 
         Returns:
-            Whether a pad is a suspect (N, P), by the rule of `Estimator.suspects`.
+            Whether a pad is a suspect (N, P), by the rule of `Estimator.find_suspects`.
         """
         group, is_used, stress = self._apply_law(rows, left_out)
         result = np.zeros(stress.shape, dtype=bool)
@@ -408,11 +408,11 @@ class Pipeline:
             calibration = self._groups[key >> 32]
             n_pads = calibration.layout.n_pads
             estimator = _find_estimator(calibration, key & 0xFFFFFFFF)
-            suspects = estimator.suspects(stress[chosen, :n_pads])
+            suspects = estimator.find_suspects(stress[chosen, :n_pads])
             result[chosen, :n_pads] = suspects
         return result
 
-    def matrix(self, cube: int, left_out: int = 0) -> Array:
+    def find_matrix(self, cube: int, left_out: int = 0) -> Array:
         """Return the matrix (15, P) from the stresses on a cube's pads to its components.
 
         Args:
@@ -426,7 +426,7 @@ class Pipeline:
         """
         return _find_estimator(self.calibrations[cube], int(left_out)).matrix
 
-    def covariance(self, cube: int, left_out: int = 0) -> Array:
+    def compute_covariance(self, cube: int, left_out: int = 0) -> Array:
         """Return the covariance (15, 15) of a cube's components due to the noise of its pads.
 
         Args:
@@ -509,7 +509,7 @@ class Pipeline:
                 columns.frequency,
                 columns.temperature,
             )
-        is_left_out = mask_bits(self._tables, group, masks)
+        is_left_out = unpack_mask_bits(self._tables, group, masks)
         is_used = is_good & ~is_left_out & is_known[:, None]
         stress = np.where(is_used, v * self._stiffness[group], 0)
         return group, is_used, stress
@@ -604,7 +604,7 @@ class Pipeline:
             # which is about 1 for noise alone.
             end = N_COMPONENTS + dof
             matrix[:n_pads, N_COMPONENTS:end] = null.T / np.sqrt(dof)
-            limit = np.sqrt(chi2_limit(dof) / dof)
+            limit = np.sqrt(compute_chi2_limit(dof) / dof)
         # The matrix will be applied to pad stresses divided by the stiffness, so the stiffness is
         # included in it.
         stiffness = self._stiffness[group]

@@ -50,7 +50,7 @@ class CubePoses(NamedTuple):
         return max(side, float(distance))
 
 
-def quaternions(rotation: Array) -> Array:
+def compute_quaternions(rotation: Array) -> Array:
     """Return the quaternions w, x, y, z (N, 4) of rotation matrices (N, 3, 3).
 
     The function loops over the matrices in Python, so it should be called once per skin and not

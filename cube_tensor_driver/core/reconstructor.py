@@ -219,13 +219,13 @@ class Reconstructor:
             out.status[:] = recorded.status
         return self.compensation.process(rows, left_out, watch=health, known=known, out=out)
 
-    def covariance(self, cube: int, left_out: int = 0) -> Array:
+    def compute_covariance(self, cube: int, left_out: int = 0) -> Array:
         """Return the covariance (15, 15) of the components of a cube's newest row.
 
         It is caused by the noise of the pads, by errors of the compensation, and by drift that
-        could not be tracked. `Pipeline.covariance` states arguments and units.
+        could not be tracked. `Pipeline.compute_covariance` states arguments and units.
         """
-        covariance = self.pipeline.covariance(cube, left_out)
+        covariance = self.pipeline.compute_covariance(cube, left_out)
         errors = self.errors(np.array([cube]), np.array([left_out]))[0]
         return covariance + errors @ errors.T if errors.any() else covariance
 
@@ -254,7 +254,7 @@ class Reconstructor:
         matrices = np.zeros((len(cubes), len(COMPONENTS), on_pads.shape[1]))
         chosen = zip(cubes.tolist(), left_out.tolist(), strict=True)
         for number, (cube, mask) in enumerate(chosen):
-            matrix = self.pipeline.matrix(cube, mask)
+            matrix = self.pipeline.find_matrix(cube, mask)
             matrices[number, :, : matrix.shape[1]] = matrix
         errors: Array = matrices @ on_pads
         return errors

@@ -97,7 +97,7 @@ def choose_illustrative_coefficients(structure: Structure) -> dict[str, float]:
     # A smaller symmetry has more coefficients. They are computed from the response matrix of the
     # largest symmetry, whose coefficients are known.
     symmetric = find_structure(layout, find_largest_symmetry(layout))
-    matrix = response(symmetric, choose_illustrative_coefficients(symmetric))
+    matrix = compute_response(symmetric, choose_illustrative_coefficients(symmetric))
     coefficients, _ = project(structure, matrix)
     return coefficients
 
@@ -111,10 +111,10 @@ def make_generic_response(structure: Structure) -> Array:
     generator = np.random.default_rng(0)
     values = generator.uniform(0.5, 1.5, structure.n_coefficients)
     coefficients = dict(zip(structure.names, values.tolist(), strict=True))
-    return response(structure, coefficients)
+    return compute_response(structure, coefficients)
 
 
-def response(structure: Structure, coefficients: Mapping[str, float]) -> Array:
+def compute_response(structure: Structure, coefficients: Mapping[str, float]) -> Array:
     """Compute the response matrix A = sum_k c_k B_k.
 
     Args:

@@ -59,7 +59,7 @@ class _Rows:
         Args:
             chosen: Row numbers, a slice or a mask (N,), with which numpy indexes an array.
         """
-        columns = self.columns()
+        columns = self.collect_columns()
         selected = {name: column[chosen] for name, column in columns.items()}
         return self.from_columns(selected)
 
@@ -68,7 +68,7 @@ class _Rows:
         """Return a table with these columns, by name."""
         return cls(**columns)
 
-    def columns(self) -> dict[str, AnyArray]:
+    def collect_columns(self) -> dict[str, AnyArray]:
         """Return the columns that the table has, by name."""
         names = (field.name for field in fields(self))  # type: ignore[arg-type]
         columns = {name: getattr(self, name) for name in names}
@@ -106,7 +106,7 @@ class FrequencyRows(_Rows):
     specific_force: Single | None = None
 
     @classmethod
-    def of(
+    def from_values(
         cls,
         cube: ArrayLike,
         frequency: ArrayLike,
@@ -177,7 +177,7 @@ class StressRows(_Rows):
         return np.hstack([self.stress, self.gradient])
 
     @classmethod
-    def of(
+    def from_values(
         cls,
         cube: ArrayLike,
         stress: ArrayLike,
@@ -217,7 +217,7 @@ def concatenate(parts: Sequence[_Kind]) -> _Kind:
 
     A column that one of the tables lacks (None) is left out of the result.
     """
-    columns = [part.columns() for part in parts]
+    columns = [part.collect_columns() for part in parts]
     common = [name for name in columns[0] if all(name in column for column in columns)]
     joined = {}
     for name in common:

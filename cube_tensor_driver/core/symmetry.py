@@ -229,7 +229,7 @@ def find_structure(
     modes = modes or choose_default_modes(layout)
     elements = find_layout_group(layout, symmetry)
     pad_images = np.array([map_pads(layout, element) for element in elements])
-    actions = [modes.action(element) for element in elements]
+    actions = [modes.compute_action(element) for element in elements]
     mode_images, mode_signs = _read_signed_permutations(np.array(actions))
 
     letters: dict[str, tuple[str, int]] = {}

@@ -28,7 +28,7 @@ _FIXED_AXES = "sxyz"
 REP 103."""
 
 
-def principal_stresses(stress: Real) -> tuple[Array, Array]:
+def compute_principal_stresses(stress: Real) -> tuple[Array, Array]:
     """Compute principal stresses and their directions.
 
     Args:
@@ -52,7 +52,7 @@ def principal_stresses(stress: Real) -> tuple[Array, Array]:
     return values, directions
 
 
-def invariants(stress: Real) -> Array:
+def compute_invariants(stress: Real) -> Array:
     """Compute the invariants I1, I2, I3 (..., 3) of a stress tensor s (..., 6) in Pa.
 
     I1 = tr s in Pa, I2 = (I1^2 - tr s^2) / 2 in Pa^2, and I3 = det s in Pa^3.
@@ -64,7 +64,7 @@ def invariants(stress: Real) -> Array:
     return np.stack([trace, second, np.linalg.det(matrices)], axis=-1)
 
 
-def von_mises(stress: Real) -> Array:
+def compute_von_mises(stress: Real) -> Array:
     """Compute the von Mises stress ``sqrt(3/2 |deviator|^2)`` of each stress tensor (..., 6).
 
     The deviator is the tensor minus the mean of its normal stresses. The result has the unit of the
@@ -78,7 +78,7 @@ def von_mises(stress: Real) -> Array:
     return result
 
 
-def traction(stress: Real, normal: ArrayLike) -> Array:
+def compute_traction(stress: Real, normal: ArrayLike) -> Array:
     """Compute the traction sigma n (force per area on a plane), in the unit of the stress (..., 3).
 
     Args:
@@ -215,7 +215,7 @@ def face_force(stress: Real, side: Array | float) -> Real:
     return side**2 * traction
 
 
-def contact_wrench(
+def compute_contact_wrench(
     stress: Real,
     gradient: Real,
     side: float | Array,
@@ -244,4 +244,4 @@ def contact_wrench(
     direction = np.stack([zz_y, -zz_x, unknown_twist], axis=-1)
     # A normal stress that grows linearly over the square causes a torque, as in a bent beam.
     second_moment_of_area = side**4 / 12
-    return face_force(stress, side), second_moment_of_area * direction
+    return compute_face_force(stress, side), second_moment_of_area * direction

@@ -312,6 +312,6 @@ def compute_component_noise(skin: Skin) -> Array:
     pipeline = Pipeline(skin.calibrations)
     variances = []
     for cube in range(len(skin.cubes)):
-        covariance = pipeline.covariance(cube)
+        covariance = pipeline.compute_covariance(cube)
         variances.append(np.diag(covariance))
     return np.sqrt(np.array(variances))

@@ -253,7 +253,7 @@ def _describe_skin(skin: Skin) -> dict[str, object]:
     cubes = [
         {
             "name": cube.name,
-            "frame": skin.frame(cube),
+            "frame": skin.make_frame_id(cube),
             "xyz": cube.xyz,
             "rpy": cube.rpy,
             "half_side": cube.calibration.half_side,

@@ -106,7 +106,7 @@ class Children:
         """Let a process that `pause` has suspended run again (SIGCONT)."""
         _signal_session(self._processes[executable], signal.SIGCONT)
 
-    def names(self) -> list[str]:
+    def list_names(self) -> list[str]:
         """Return the names of the processes that were started and that `end` has not ended yet."""
         return list(self._processes)
 

@@ -23,7 +23,7 @@ MAX_DOMAIN = 232
 """Largest number of a DDS domain. The UDP ports of larger ones would exceed 65535."""
 
 MAX_OWN_DOMAIN = 100
-"""Largest number of a DDS domain that `own_domain` chooses. Linux assigns the UDP ports of higher
+"""Largest number of a DDS domain that `use_own_domain` chooses. Linux assigns the UDP ports of higher
 domains (from 32768 up) to any program that asks for a free port."""
 
 FIRST_PORT = 7400
@@ -73,7 +73,7 @@ def is_domain_used() -> bool:
 
 
 @contextmanager
-def own_domain() -> Iterator[int]:
+def use_own_domain() -> Iterator[int]:
     """Set, for a `with` block, a DDS domain that no other process on this host uses.
 
     The domain holds for this process and for those that it starts in the block. Their nodes are not

@@ -274,7 +274,7 @@ def make_info_message(
     for number, cube in enumerate(skin.cubes):
         calibration = cube.calibration
         n_pads = calibration.layout.n_pads
-        info = _make_cube_info(cube, skin.frame(cube))
+        info = _make_cube_info(cube, skin.make_frame_id(cube))
         info.uid = cube.uid or uids.get(number, 0)
         info.rest_frequency = rest_frequency[number, :n_pads].tolist()
         message.cubes.append(info)
@@ -283,7 +283,7 @@ def make_info_message(
         if calibration.id not in message.calibration_ids:
             message.calibration_ids.append(calibration.id)
             message.calibrations.append(format_calibration(calibration))
-            covariances.append(pipeline.covariance(number))
+            covariances.append(pipeline.compute_covariance(number))
     message.covariance = pack_array("d", np.array(covariances))
     return message
 

@@ -180,7 +180,7 @@ class SkinSubscriberNode(CubeNode):
         Args:
             skin: The state of the skin.
             health: Health of each cube, (cubes,): fine, doubtful, faulty or stale, as
-                `LatestStress.health` returns it.
+                `LatestStress.compute_health` returns it.
         """
 
     def follow_stress(self, skin: FollowedSkin, health: Index) -> object:

@@ -20,7 +20,7 @@ from ..core.arrays import Array, Index
 from ..core.calibration import Calibration, tabulate_pads
 from ..core.errors import ConfigError
 from ..core.modes import COMPONENTS, to_gradient_tensor
-from ..core.oscillator import pad_frequency
+from ..core.oscillator import compute_pad_frequency
 from ..core.poses import CubePoses
 from ..device.wire.protocol import NOT_MEASURED
 from .imperfections import NONE, Imperfections, PadBehaviour
@@ -144,7 +144,7 @@ class SimulatedCubes:
             pad_stress += self.heavy.stress(seconds)
         # Imperfections change the stress that determines a pad's frequency.
         reported = self._behaviour.compute_reported(pad_stress, seconds)
-        hertz = pad_frequency(
+        hertz = compute_pad_frequency(
             reported,
             rest,
             beta,
@@ -334,7 +334,7 @@ def compute_true_state(
     """
     # The modes take gradients in Pa, as the change of the stress over half the side of a cube.
     change = to_gradient_tensor(gradient) * calibration.half_side
-    return calibration.modes.state(stress, change)
+    return calibration.modes.compute_state(stress, change)
 
 
 def compute_skin_components(

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypedDict, cast
 
-from ..config.schema import Schema, integer, mapping, real
+from ..config.schema import Schema, make_integer_schema, make_mapping_schema, make_number_schema
 from ..core.errors import ConfigError
 
 KINDS = {
@@ -64,13 +64,13 @@ MOMENTARY_FAULTS = (*FRAME_FAULTS, "reset", "wrap", "drift", "step")
 """Kinds of faults without a duration: they end as soon as they have begun. All other kinds last for
 the time `seconds` of the fault."""
 
-_AMOUNT = real("a number from 0 up", minimum=0)
+_AMOUNT = make_number_schema("a number from 0 up", minimum=0)
 """Schema of a time in s, which is not negative. Only the size of a fault (`value`) may be negative:
 a clock may run slow, and a temperature may fall."""
-_COUNT = integer(0, MAX_COUNT, "a whole number from 0 up")
+_COUNT = make_integer_schema(0, MAX_COUNT, "a whole number from 0 up")
 """Schema of a number of samples and of an index of a cube or pad."""
 _SCHEMA = Schema(
-    mapping(
+    make_mapping_schema(
         ["kind"],
         {
             "kind": {"enum": list(KINDS), "description": ", ".join(KINDS)},
@@ -80,7 +80,7 @@ _SCHEMA = Schema(
             "count": _COUNT,
             "cube": _COUNT,
             "pad": _COUNT,
-            "value": real("a finite number"),
+            "value": make_number_schema("a finite number"),
         },
     )
 )

@@ -35,7 +35,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ..config.schema import TEXT, JsonSchema, Schema, integer, mapping, real
+from ..config.schema import (
+    TEXT,
+    JsonSchema,
+    Schema,
+    make_integer_schema,
+    make_mapping_schema,
+    make_number_schema,
+)
 from ..config.yaml import read_yaml
 from ..core.arrays import Array
 from ..core.errors import ConfigError
@@ -80,39 +87,45 @@ def _make_table_schema(columns: str, *schemas: JsonSchema) -> JsonSchema:
     }
 
 
-_NUMBER = real("a number")
+_NUMBER = make_number_schema("a number")
 """Schema of a number of any size."""
 _KNOTS = _make_table_schema("seconds, °C", _NUMBER, _NUMBER)
 """Schema of a temperature that is linear in time between the given points."""
 
 _SCHEMA = Schema(
-    mapping(
+    make_mapping_schema(
         (),
         {
-            "gain_spread": real("a number from 0 to below 1", minimum=0, exclusiveMaximum=1),
-            "dead": real("a fraction of the pads from 0 to 1", minimum=0, maximum=1),
+            "gain_spread": make_number_schema(
+                "a number from 0 to below 1", minimum=0, exclusiveMaximum=1
+            ),
+            "dead": make_number_schema("a fraction of the pads from 0 to 1", minimum=0, maximum=1),
             "creep": _make_table_schema(
                 "size, seconds",
-                real("a size from 0 up", minimum=0),
-                real("a time above 0 s", exclusiveMinimum=0),
+                make_number_schema("a size from 0 up", minimum=0),
+                make_number_schema("a time above 0 s", exclusiveMinimum=0),
             ),
-            "creep_growth": real("a growth from 0 to below 1", minimum=0, exclusiveMaximum=1),
-            "creep_exponent": real(
+            "creep_growth": make_number_schema(
+                "a growth from 0 to below 1", minimum=0, exclusiveMaximum=1
+            ),
+            "creep_exponent": make_number_schema(
                 "an exponent between 0 and 1",
                 exclusiveMinimum=0,
                 exclusiveMaximum=1,
             ),
-            "creep_spread": real("a number from 0 to below 1", minimum=0, exclusiveMaximum=1),
+            "creep_spread": make_number_schema(
+                "a number from 0 to below 1", minimum=0, exclusiveMaximum=1
+            ),
             "temperature": _KNOTS,
             "air": _KNOTS,
-            "heat_exchange": real("a number above 0 in W/(m² K)", exclusiveMinimum=0),
+            "heat_exchange": make_number_schema("a number above 0 in W/(m² K)", exclusiveMinimum=0),
             "thermal_stress": TEXT,
-            "pad_drift": real("a relative change per K"),
-            "pad_drift_spread": real("a number from 0 up", minimum=0),
-            "layer_spread": real("a number from 0 to 0.3", minimum=0, maximum=0.3),
+            "pad_drift": make_number_schema("a relative change per K"),
+            "pad_drift_spread": make_number_schema("a number from 0 up", minimum=0),
+            "layer_spread": make_number_schema("a number from 0 to 0.3", minimum=0, maximum=0.3),
             "poses": _make_table_schema("seconds, x, y, z, roll, pitch, yaw", *[_NUMBER] * 7),
             "weight": TEXT,
-            "seed": integer(0, MAX_SEED, "a whole number from 0 up"),
+            "seed": make_integer_schema(0, MAX_SEED, "a whole number from 0 up"),
         },
     )
 )

@@ -220,7 +220,7 @@ class SkinPads:
             if pads.heavy is not None:
                 forces.append(pads.heavy.compute_specific_force(seconds))
             start = rows.stop
-        return FrequencyRows.of(
+        return FrequencyRows.from_values(
             self._cube,
             frequency,
             sequence=number % COUNTER_RANGE,

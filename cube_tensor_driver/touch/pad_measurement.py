@@ -102,7 +102,7 @@ def model_pads(
     for number, calibration in enumerate(variants):
         matches = _match_pads(influence, calibration)
         own = all_pads[:, matches]
-        matrix = np.nan_to_num(pipeline.matrix(number))
+        matrix = np.nan_to_num(pipeline.find_matrix(number))
         components.append(own @ matrix.T)  # circular components -> pads -> measured components
         pads[number, :, : own.shape[1]] = own / calibration.noise
 

@@ -50,7 +50,7 @@ def compute_noise_by_pad(
     cube_masks = zip(cubes.tolist(), left_out.tolist(), strict=True)
     for row, (cube, mask) in enumerate(cube_masks):
         calibration = pipeline.calibrations[cube]
-        own = pipeline.matrix(cube, mask) * calibration.noise
+        own = pipeline.find_matrix(cube, mask) * calibration.noise
         by_pad[row, :, : own.shape[1]] = own
     return by_pad
 

@@ -208,7 +208,7 @@ class Touch:
         self.limit = max(0.0, limit - OVERSHOOT)
 
         self._pipeline = Pipeline(skin.calibrations)
-        covariances = [self._pipeline.covariance(cube) for cube in range(n)]
+        covariances = [self._pipeline.compute_covariance(cube) for cube in range(n)]
         covariance = np.array(covariances)
         variance = np.diagonal(covariance, axis1=1, axis2=2)
         pressure_variance = variance[:, PRESSURE]
@@ -346,7 +346,7 @@ class Touch:
         self._restart(cubes)
         self._left_out[cubes] = left_out
         for cube, mask in zip(cubes.tolist(), left_out.tolist(), strict=True):
-            covariance = self._pipeline.covariance(cube, mask)
+            covariance = self._pipeline.compute_covariance(cube, mask)
             self._deviation[cube] = np.sqrt(covariance[PRESSURE, PRESSURE])
 
     def _compute_gain(

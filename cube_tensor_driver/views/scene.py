@@ -20,7 +20,7 @@ from ..core.arrays import AnyArray, Array, Mask
 from ..core.latest_stress import FINE
 from ..core.modes import COMPONENTS, STRESS
 from ..core.poses import CubePoses
-from ..core.tensor import TRACTION_COMPONENTS, principal_stresses
+from ..core.tensor import TRACTION_COMPONENTS, compute_principal_stresses
 
 
 def _make_colour_table(hexes: str) -> Array:
@@ -377,7 +377,7 @@ def make_principal_crosses(
     """
     stress = np.nan_to_num(values[:, : len(STRESS)])
     # Each row of `directions` is one principal direction, in the frame of the cube.
-    principal, directions = principal_stresses(stress)
+    principal, directions = compute_principal_stresses(stress)
     in_parent = np.einsum("nij,nkj->nki", poses.rotation, directions)
     half_length = 0.5 * length * np.abs(principal)
     half = in_parent * half_length[..., None]

@@ -52,7 +52,7 @@ from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.yaml import parse_yaml, read_yaml, write_yaml
 from cube_tensor_driver.core.errors import BagError
-from cube_tensor_driver.core.oscillator import pad_frequency
+from cube_tensor_driver.core.oscillator import compute_pad_frequency
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
 from cube_tensor_driver.core.status import PAD_FAULT, STAMP, STUCK
@@ -282,7 +282,7 @@ def test_tare_in_the_middle_counts_from_its_time_on(tmp_path):
     for k, record in enumerate(stress(tmp_path / "out").values()):
         of = pipeline if k < 50 else tared
         expected = of.process(
-            FrequencyRows.of(record.cube, loads(pipeline, 0.01 * k).astype(np.float32))
+            FrequencyRows.from_values(record.cube, loads(pipeline, 0.01 * k).astype(np.float32))
         )
         np.testing.assert_array_equal(record.stress, expected.stress, err_msg=str(k))
 
@@ -651,7 +651,9 @@ def test_fit_from_a_bag(tmp_path, capsys):
         for k in range(80):
             state = 3000 * np.sin(0.1 * k * (1 + np.arange(modes.n_modes)))
             v = calibration.response @ state
-            f = pad_frequency(v, calibration.rest_frequency, calibration.beta, calibration.modulus)
+            f = compute_pad_frequency(
+                v, calibration.rest_frequency, calibration.beta, calibration.modulus
+            )
             stamp = START_NS + 10_000_000 * k
             put("/frequencies", stamp, frequencies_of(k, stamp, f[None]))
             values = modes.components @ state

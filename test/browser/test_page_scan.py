@@ -86,7 +86,7 @@ def test_without_the_node_the_field_is_the_pressure_on_the_surface():
 def rows(number: int) -> StressRows:
     """Scan `number` of one cube, with this zz."""
     stress = np.full((1, 6), float(number))
-    return StressRows.of([0], stress, np.zeros((1, 9)), stamp_ns=number, sequence=number)
+    return StressRows.from_values([0], stress, np.zeros((1, 9)), stamp_ns=number, sequence=number)
 
 
 def shown(scans: ScanSynchronizer) -> tuple[float, object]:
@@ -131,7 +131,7 @@ def test_the_rate_is_that_of_the_samples_whatever_arrives():
         for number in numbers[::2]:
             sequence = np.full(1, number % 2**32, np.uint32)
             rate.update(
-                rows(0).__class__.of(
+                rows(0).__class__.from_values(
                     [1],
                     np.zeros((1, 6)),
                     np.zeros((1, 9)),

@@ -183,7 +183,7 @@ class Source:
     def _publish_scan(self, number: int) -> None:
         stress = np.zeros((N, 6), np.float32)
         stress[CHOSEN, 2], stress[0, 2] = -STEP_PA * number, -TOP_PA
-        rows = StressRows.of(
+        rows = StressRows.from_values(
             np.arange(N),
             stress,
             np.zeros((N, 9), np.float32),

@@ -39,7 +39,7 @@ from conftest import ROOT, encoded, end
 from cube_tensor_driver.browser.page import LEFT_WIDTH
 from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import read_skin
-from cube_tensor_driver.core.oscillator import pad_frequency
+from cube_tensor_driver.core.oscillator import compute_pad_frequency
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.msg import SkinFrequencies, SkinStress
 from cube_tensor_driver.processes.children import Children
@@ -103,7 +103,7 @@ class Skin(threading.Thread):
         state[PRESSED, 0] = zz
         calibration = SKIN.cubes[0].calibration
         law = calibration.rest_frequency, calibration.beta, calibration.modulus
-        self._frequency = pad_frequency(state @ calibration.response.T, *law)
+        self._frequency = compute_pad_frequency(state @ calibration.response.T, *law)
 
     def run(self) -> None:
         noise = np.random.default_rng(3)

@@ -325,7 +325,7 @@ def live_table(width: int) -> tuple[str, list[str]]:
     stress, gradient = np.full((n, 6), np.nan, np.float32), np.full((n, 9), np.nan, np.float32)
     stress[:, [0, 2, 4]], gradient[:, [6, 8]] = -123e3, -12e6
     table = LiveTable(skin, show=False)
-    table.update(StressRows.of(np.arange(n), stress, gradient, residual=1.0))
+    table.update(StressRows.from_values(np.arange(n), stress, gradient, residual=1.0))
     shown = console.Console(width=width, record=True, file=io.StringIO())
     shown.print(table.draw(n, width))
     text = shown.export_text()

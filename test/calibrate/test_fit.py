@@ -14,11 +14,11 @@ from cube_tensor_driver.calibrate.fit import (
     loads_from_forces,
     measured_stress,
 )
-from cube_tensor_driver.core.calibration import Calibration, illustrative
+from cube_tensor_driver.core.calibration import Calibration, make_illustrative_calibration
 from cube_tensor_driver.core.errors import FitError
 from cube_tensor_driver.core.modes import SPACE
-from cube_tensor_driver.core.oscillator import TemperatureModel, pad_frequency
-from cube_tensor_driver.core.response import choose_illustrative_coefficients, response
+from cube_tensor_driver.core.oscillator import TemperatureModel, compute_pad_frequency
+from cube_tensor_driver.core.response import choose_illustrative_coefficients, compute_response
 from cube_tensor_driver.core.symmetry import find_structure
 
 
@@ -29,14 +29,17 @@ class Bench:
         self, layout: str, symmetry: str, seed: int, loads: int = 20, noise: float = 1e-3
     ) -> None:
         rng = np.random.default_rng(seed)
-        self.base = illustrative(layout)
+        self.base = make_illustrative_calibration(layout)
         self.structure = find_structure(self.base.layout, symmetry)
         self.coefficients = choose_illustrative_coefficients(self.structure)
         self.gain = 1 + 0.05 * rng.normal(size=self.base.layout.n_pads)
         for orbit in self.structure.pad_orbits:
             self.gain[orbit] /= self.gain[orbit].mean()
         self.loads = 1e4 * rng.normal(size=(loads, self.structure.modes.n_modes))
-        clean = self.loads @ (self.gain[:, None] * response(self.structure, self.coefficients)).T
+        clean = (
+            self.loads
+            @ (self.gain[:, None] * compute_response(self.structure, self.coefficients)).T
+        )
         self.noise = noise * np.sqrt(np.mean(clean**2))
         self.readings = clean + self.noise * rng.normal(size=clean.shape)
 
@@ -113,7 +116,7 @@ def test_noise_of_another_size_is_found():
 def test_what_the_loads_leave_open_is_said_and_following_the_advice_settles_it():
     bench = Bench("planar", "full", 4)
     bench.loads[:, 3:] = 0
-    a = bench.gain[:, None] * response(bench.structure, bench.coefficients)
+    a = bench.gain[:, None] * compute_response(bench.structure, bench.coefficients)
     rng = np.random.default_rng(0)
     bench.readings = bench.loads @ a.T + bench.noise * rng.normal(size=(20, 8))
     result = bench.fit()
@@ -129,7 +132,7 @@ def test_what_the_loads_leave_open_is_said_and_following_the_advice_settles_it()
     with pytest.raises(FitError, match=r"do not determine e, f.*fixed"):
         result.make_calibration(bench.base)
     advised = [text.split("a load of ")[1].split()[0] for text in result.advice]
-    extra = 1e4 * np.eye(7)[bench.structure.modes.index(advised)]
+    extra = 1e4 * np.eye(7)[bench.structure.modes.find_indices(advised)]
     bench.loads = np.vstack([bench.loads, extra])
     bench.readings = bench.loads @ a.T + bench.noise * rng.normal(size=(22, 8))
     assert not bench.fit().undetermined
@@ -143,7 +146,7 @@ def test_what_the_loads_leave_open_is_said_and_following_the_advice_settles_it()
 def test_loads_in_proportion_are_not_told_apart():
     bench = Bench("quad", "mirrors", 5)
     bench.loads[:, bench.structure.modes.names.index("xx")] = 0.5 * bench.loads[:, 0]
-    a = bench.gain[:, None] * response(bench.structure, bench.coefficients)
+    a = bench.gain[:, None] * compute_response(bench.structure, bench.coefficients)
     result = fit(bench.structure, bench.loads, bench.loads @ a.T + bench.noise, bench.noise)
     assert result.undetermined == ("a", "b") and len(result.advice) == 1
 
@@ -163,10 +166,11 @@ def test_a_fit_becomes_a_calibration():
 
 def test_readings_from_frequencies():
     c = dataclasses.replace(
-        illustrative("planar"), temperature=TemperatureModel(25, np.full((8, 1), 1e-4))
+        make_illustrative_calibration("planar"),
+        temperature=TemperatureModel(25, np.full((8, 1), 1e-4)),
     )
     v = np.random.default_rng(0).normal(size=(5, 8)) * 1e3
-    f = pad_frequency(v, c.rest_frequency * 1.001, c.beta, c.modulus)
+    f = compute_pad_frequency(v, c.rest_frequency * 1.001, c.beta, c.modulus)
     np.testing.assert_allclose(measured_stress(c, f, np.full(5, 35.0)), v, atol=1e-6)
     f[2, 3] = 1e9
     with pytest.raises(FitError, match=r"load 3, pad -z\+x: 1e\+09 Hz"):
@@ -188,7 +192,7 @@ def test_loads_from_a_reference_force_sensor():
 
 
 def test_without_gains_fewer_loads_are_enough():
-    c = illustrative("planar")
+    c = make_illustrative_calibration("planar")
     loads = 1e4 * np.eye(7)[[0, 3, 4, 1]]
     readings = loads @ c.response.T
     assert fit(c.structure, loads, readings, gains=False).undetermined == ()
@@ -223,7 +227,7 @@ def test_what_cannot_be_fitted_is_an_error_with_its_reason(change, words):
 
 
 def test_one_load_alone_settles_no_coefficient():
-    c = illustrative("cube")
+    c = make_illustrative_calibration("cube")
     loads = loads_from_forces(c.modes, np.array([[0, 0, -1.0]]), 1e-4)
     with pytest.raises(FitError, match=r"determine no coefficient.*add a load of"):
         fit(c.structure, loads, loads @ c.response.T)

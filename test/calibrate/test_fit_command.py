@@ -18,10 +18,10 @@ import pytest
 from conftest import ROOT
 from cube_tensor_driver.calibrate.load_table import read_loads
 from cube_tensor_driver.config.calibration import read_calibration
-from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.calibration import make_illustrative_calibration
 from cube_tensor_driver.core.errors import FitError
 from cube_tensor_driver.core.layout import LAYOUTS
-from cube_tensor_driver.core.oscillator import pad_frequency
+from cube_tensor_driver.core.oscillator import compute_pad_frequency
 
 PLANAR = LAYOUTS["planar"]
 
@@ -39,13 +39,13 @@ def bench(seed: int, noise: float, loads: int, spread: float = 0.05, outliers: i
     rng = np.random.default_rng(seed)
     gain = 1 + spread * rng.standard_normal(8)
     truth = replace(
-        illustrative("planar"),
+        make_illustrative_calibration("planar"),
         gain=gain / gain.mean(),
         rest_frequency=100e3 * rng.uniform(0.95, 1.05, 8),
     )
     state = np.vstack([np.zeros((3, 7)), rng.uniform(-10e3, 10e3, (loads, 7))])
     v = state @ truth.response.T
-    f = pad_frequency(v, truth.rest_frequency, truth.beta, truth.modulus)
+    f = compute_pad_frequency(v, truth.rest_frequency, truth.beta, truth.modulus)
     # noise is 0.1 % of the readings' range, as a change of frequency
     f = f + noise * np.ptp(f - truth.rest_frequency) * rng.standard_normal(f.shape)
     for row in range(outliers):
@@ -54,7 +54,7 @@ def bench(seed: int, noise: float, loads: int, spread: float = 0.05, outliers: i
 
 
 def write(path: Path, state: np.ndarray, frequency: np.ndarray, **change) -> Path:
-    header = [*illustrative("planar").modes.names, *PLANAR.pads]
+    header = [*make_illustrative_calibration("planar").modes.names, *PLANAR.pads]
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(header)
@@ -120,8 +120,8 @@ def test_a_bench_is_recovered_with_its_deviations(tmp_path):
 def test_loads_that_say_too_little_name_what_to_add(tmp_path):
     _, state, frequency = bench(1, noise=0.001, loads=20)
     state[:, 3:] = 0
-    truth = illustrative("planar")
-    frequency = pad_frequency(
+    truth = make_illustrative_calibration("planar")
+    frequency = compute_pad_frequency(
         state @ truth.response.T, truth.rest_frequency, truth.beta, truth.modulus
     )
     done = cube(

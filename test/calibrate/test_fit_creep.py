@@ -26,7 +26,7 @@ from cube_tensor_driver.calibrate.creep import CreepFit, add_creep, compute_step
 from cube_tensor_driver.calibrate.fit import measured_stress
 from cube_tensor_driver.cli import main as cli
 from cube_tensor_driver.config.calibration import read_calibration
-from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.calibration import make_illustrative_calibration
 from cube_tensor_driver.core.compensation.models import CreepModel
 from cube_tensor_driver.core.errors import FitError
 from cube_tensor_driver.core.pipeline import Pipeline
@@ -36,7 +36,7 @@ from cube_tensor_driver.messages.types import FREQUENCIES, INFO
 from cube_tensor_driver.simulation.cubes import PadErrors, SimulatedCubes
 from cube_tensor_driver.simulation.imperfections import Imperfections
 
-PLAIN = illustrative("planar")
+PLAIN = make_illustrative_calibration("planar")
 PRESS = np.array([-8e3, 0, -20e3, 0, 2e3, 0])
 """Stress under the press, in Pa, order xx yy zz yz zx xy."""
 
@@ -78,9 +78,9 @@ def reconstructed(time, scale, growth, exponent=0.2, seed=0, calibration=None, b
     calibration = calibration or add_creep(PLAIN, fitted(growth, exponent, seed).model)
     reconstruct = Reconstructor([calibration])
     stamp_ns = 10**9 + np.rint(1e9 * time).astype(np.int64)
-    rows = FrequencyRows.of(np.zeros(len(time), np.uint16), frequency, stamp_ns=stamp_ns)
+    rows = FrequencyRows.from_values(np.zeros(len(time), np.uint16), frequency, stamp_ns=stamp_ns)
     error = reconstruct.process(rows).stress[:, 2] - PRESS[2] * scale
-    return error, np.sqrt(reconstruct.covariance(0)[2, 2])
+    return error, np.sqrt(reconstruct.compute_covariance(0)[2, 2])
 
 
 GROWTHS = [0.05, 0.1, 0.25]
@@ -186,7 +186,7 @@ def test_three_commands_lead_from_a_bag_to_a_calibration(tmp_path, capsys, base)
         for n, pads in enumerate(frequency.astype(np.float32)):
             stamp_ns = START_NS + n * 100_000_000
             number = np.zeros(1, np.uint16)
-            rows = FrequencyRows.of(number, pads[None], stamp_ns=stamp_ns, sequence=n)
+            rows = FrequencyRows.from_values(number, pads[None], stamp_ns=stamp_ns, sequence=n)
             writer.write("/frequencies", stamp_ns, encoded(rows, b"base\0"))
     assert cli.main(["fit", "--creep", str(bag), "-o", str(saved)]) == 0
     assert "relaxation times explain a hold of 85 s to 0.0" in capsys.readouterr().out

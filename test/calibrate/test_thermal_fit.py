@@ -56,7 +56,7 @@ def play(cubes: SimulatedCubes, seconds: np.ndarray, load: np.ndarray):
     stress, gradient = np.tile(load, (N_CUBES, 1)), np.zeros((N_CUBES, 6, 3))
     for number, time in enumerate(seconds.tolist()):
         hertz = cubes.frequency(stress, gradient, time) * 1e-3
-        yield FrequencyRows.of(
+        yield FrequencyRows.from_values(
             np.arange(N_CUBES, dtype=np.uint16),
             hertz.astype(np.float32),
             stamp_ns=START_NS + round(time * 1e9),
@@ -145,7 +145,10 @@ def test_the_deviation_states_the_error_of_ramps(fitted, ramp):
         stress = reconstruct.process(rows).stress
         if rows.stamp_ns[0] - START_NS > 1200e9:
             errors.append(stress[:, :3])
-            grown = [reconstruct.covariance(k) - reconstruct.pipeline.covariance(k) for k in (0, 1)]
+            grown = [
+                reconstruct.compute_covariance(k) - reconstruct.pipeline.compute_covariance(k)
+                for k in (0, 1)
+            ]
             stated.append([np.diag(one)[:3] for one in grown])
     ratio = np.sqrt((np.array(errors) ** 2).mean(axis=(0, 1)) / np.mean(stated, axis=(0, 1)))
     # Measured: 0.68 to 1.11 of "both"; of "ground" 0.18 to 0.41 (60 s, errors of at most 2 Pa) and

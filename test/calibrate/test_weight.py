@@ -24,11 +24,11 @@ from cube_tensor_driver.cli import main as cli
 from cube_tensor_driver.config.calibration import find_shipped_calibration, read_calibration
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.yaml import write_yaml
-from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.calibration import make_illustrative_calibration
 from cube_tensor_driver.core.compensation.models import WeightModel
 from cube_tensor_driver.core.errors import BagError
 from cube_tensor_driver.core.layout import LAYOUTS
-from cube_tensor_driver.core.oscillator import pad_frequency
+from cube_tensor_driver.core.oscillator import compute_pad_frequency
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows
@@ -41,7 +41,7 @@ from cube_tensor_driver.simulation.source import simulate
 
 G = 9.80665
 RNG = np.random.default_rng(5)
-BASE = replace(illustrative("planar"), gain=1 + 0.05 * RNG.normal(size=8))
+BASE = replace(make_illustrative_calibration("planar"), gain=1 + 0.05 * RNG.normal(size=8))
 RESPONSE = 8 * RNG.normal(size=(8, 3))
 POSES = [[0, 0, G], [0, 0, -G], [G, 0, 0], [0, -G, 0], [0, G, 0], [-G, 0, 0]]
 SECONDS = 5.0
@@ -74,9 +74,11 @@ def make_bag(folder, poses=POSES, spread=0.0, cubes=3, motion=True, **changes):
         force = force_at(n / 25, poses)
         pads = (BASE.gain[:, None] * responses) @ force + offset * (1 + n / 2000)
         pads = pads + BASE.noise * rng.normal(size=pads.shape)
-        rows = FrequencyRows.of(
+        rows = FrequencyRows.from_values(
             np.arange(cubes, dtype=np.uint16),
-            pad_frequency(pads, BASE.rest_frequency, BASE.beta, BASE.modulus).astype(np.float32),
+            compute_pad_frequency(pads, BASE.rest_frequency, BASE.beta, BASE.modulus).astype(
+                np.float32
+            ),
             stamp_ns=n * 40_000_000,
             sequence=n,
             specific_force=force,

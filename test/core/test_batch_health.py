@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from conftest import check, stamped
-from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.calibration import make_illustrative_calibration
 from cube_tensor_driver.core.health.health import Health
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.status import STAMP
@@ -21,7 +21,9 @@ from cube_tensor_driver.core.status import STAMP
 def test_many_at_once_is_one_by_one_to_the_bit(kinds, faults):
     rng = np.random.default_rng(11)
     n, count = 6, 400
-    pipeline = Pipeline([illustrative(kinds[k % len(kinds)]) for k in range(n)], np.float32)
+    pipeline = Pipeline(
+        [make_illustrative_calibration(kinds[k % len(kinds)]) for k in range(n)], np.float32
+    )
     frequency = pipeline.rest_frequency * (1 - 0.02 * rng.random((count, n, pipeline.n_pads)))
     frequency = frequency.astype(np.float32)
     pad_fault = np.zeros((count, n), np.uint32)
@@ -68,4 +70,4 @@ def test_many_at_once_is_one_by_one_to_the_bit(kinds, faults):
         np.testing.assert_array_equal(getattr(many, name), getattr(single, name), err_msg=name)
     np.testing.assert_array_equal(many.diagnosis.still, single.diagnosis.still)
     np.testing.assert_array_equal(many.sums.cubes["mask"], single.sums.cubes["mask"])
-    np.testing.assert_array_equal(many.sums.pads("last"), single.sums.pads("last"))
+    np.testing.assert_array_equal(many.sums.view_pads("last"), single.sums.view_pads("last"))

@@ -9,16 +9,16 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from cube_tensor_driver.core.calibration import Calibration, illustrative
+from cube_tensor_driver.core.calibration import Calibration, make_illustrative_calibration
 from cube_tensor_driver.core.compensation.models import CreepModel, ThermalModel, WeightModel
 from cube_tensor_driver.core.errors import CalibrationError
-from cube_tensor_driver.core.oscillator import pad_frequency
+from cube_tensor_driver.core.oscillator import compute_pad_frequency
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
 from cube_tensor_driver.core.status import COMPENSATION, PAD_FAULT, WEIGHT
 
 RNG = np.random.default_rng(1)
-PLAIN = replace(illustrative("planar"), gain=1 + 0.05 * RNG.normal(size=8))
+PLAIN = replace(make_illustrative_calibration("planar"), gain=1 + 0.05 * RNG.normal(size=8))
 RESPONSE = 8 * RNG.normal(size=(8, 3))
 HEAVY = replace(PLAIN, weight=WeightModel(RESPONSE))
 CUBES = 3
@@ -28,13 +28,13 @@ def played(loads, forces, calibration: Calibration = HEAVY, **columns) -> Freque
     """Rows of three cubes under loads (N, M) of modes and specific forces (N, 3)."""
     forces = np.broadcast_to(forces, (len(loads), 3))
     pads = loads @ calibration.response.T + forces @ (calibration.gain[:, None] * RESPONSE).T
-    frequency = pad_frequency(
+    frequency = compute_pad_frequency(
         pads, calibration.rest_frequency, calibration.beta, calibration.modulus
     )
     scan = np.arange(len(loads)) // CUBES
     cube = np.arange(len(loads), dtype=np.uint16) % CUBES
     columns = {"specific_force": forces, **columns}
-    return FrequencyRows.of(cube, frequency, stamp_ns=4_000_000 * (scan + 1), **columns)
+    return FrequencyRows.from_values(cube, frequency, stamp_ns=4_000_000 * (scan + 1), **columns)
 
 
 def loads_of(n: int) -> np.ndarray:
@@ -73,11 +73,11 @@ def test_an_unknown_force_is_not_compensated_and_widens_the_covariance():
     assert bits.tolist() == [WEIGHT] * 3 + [COMPENSATION] * 2 + [WEIGHT]
     plain = Reconstructor([PLAIN] * CUBES, np.float64).process(replace(rows, specific_force=None))
     np.testing.assert_array_equal(found.stress[3:5], plain.stress[3:5])
-    noise = reconstruct.pipeline.covariance(0)
-    np.testing.assert_array_equal(reconstruct.covariance(2), noise)
+    noise = reconstruct.pipeline.compute_covariance(0)
+    np.testing.assert_array_equal(reconstruct.compute_covariance(2), noise)
     # 1 g along each axis, through the matrix of the pads
-    response = reconstruct.pipeline.matrix(0) @ (HEAVY.gain[:, None] * RESPONSE) * 9.80665
-    grown = reconstruct.covariance(0) - noise
+    response = reconstruct.pipeline.find_matrix(0) @ (HEAVY.gain[:, None] * RESPONSE) * 9.80665
+    grown = reconstruct.compute_covariance(0) - noise
     np.testing.assert_allclose(grown, response @ response.T, rtol=1e-6, atol=1e-6)
 
 
@@ -86,14 +86,14 @@ def test_a_stated_deviation_of_the_response_enters_the_covariance():
     cube = replace(HEAVY, weight=WeightModel(RESPONSE, deviation))
     reconstruct = Reconstructor([cube] * CUBES, np.float64)
     reconstruct(played(loads_of(3), [0, 0, -9.81]))
-    expected = reconstruct.pipeline.matrix(1) @ (HEAVY.gain * deviation[:, 2] * 9.81)
-    grown = reconstruct.covariance(1) - reconstruct.pipeline.covariance(1)
+    expected = reconstruct.pipeline.find_matrix(1) @ (HEAVY.gain * deviation[:, 2] * 9.81)
+    grown = reconstruct.compute_covariance(1) - reconstruct.pipeline.compute_covariance(1)
     np.testing.assert_allclose(grown, np.outer(expected, expected), rtol=1e-5, atol=1e-6)
 
 
 def test_errors_of_cubes_with_other_pads_and_models_are_those_of_each_alone():
     """With times, causes, powers and pads that other cubes do not have, and a pad left out."""
-    large = illustrative("cube")
+    large = make_illustrative_calibration("cube")
     few, many = np.arange(1.0, 9.0)[:, None], np.arange(1.0, 25.0)[:, None]
     creep = CreepModel(
         np.array([0.1, 2.0]), 0.01 * np.hstack([few, few]), RNG.normal(size=(1, 8, 2))
@@ -117,14 +117,14 @@ def test_errors_of_cubes_with_other_pads_and_models_are_those_of_each_alone():
             frequency[c, : one.gain.size] = one.rest_frequency * (1 + 1e-4 * k)
         known = {"stamp_ns": 10**9 + 50_000_000 * k, "temperature": warm}
         number = np.arange(3, dtype=np.uint16)
-        together(FrequencyRows.of(number, frequency, specific_force=forces, **known))
+        together(FrequencyRows.from_values(number, frequency, specific_force=forces, **known))
         for c, one in enumerate(alone):
             own = frequency[c : c + 1, : cubes[c].gain.size]
-            one(FrequencyRows.of(number[:1], own, specific_force=forces[:1], **known))
+            one(FrequencyRows.from_values(number[:1], own, specific_force=forces[:1], **known))
     errors = together.errors(np.arange(3), np.array([1, 2, 0]))
     assert not errors[2][np.isfinite(errors[2])].any()
     for c, mask in enumerate([1, 2]):
-        grown = alone[c].covariance(0, mask) - alone[c].pipeline.covariance(0, mask)
+        grown = alone[c].compute_covariance(0, mask) - alone[c].pipeline.compute_covariance(0, mask)
         assert np.nanmax(grown) > 100
         np.testing.assert_allclose(errors[c] @ errors[c].T, grown, rtol=1e-4, atol=1e-2)
 

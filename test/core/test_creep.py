@@ -10,16 +10,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.calibration import make_illustrative_calibration
 from cube_tensor_driver.core.compensation.low_pass import compute_relaxed_share
 from cube_tensor_driver.core.compensation.models import CreepModel
 from cube_tensor_driver.core.errors import CalibrationError, LayoutError
-from cube_tensor_driver.core.oscillator import pad_frequency
+from cube_tensor_driver.core.oscillator import compute_pad_frequency
 from cube_tensor_driver.core.reconstructor import Reconstructor, RecordedHealth
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
 from cube_tensor_driver.core.status import COMPENSATION, CREEP
 
-PLAIN = illustrative("planar")
+PLAIN = make_illustrative_calibration("planar")
 TIME = np.array([0.1, 1.0, 10.0, 100.0])
 AMPLITUDE = 0.02 * (1 + 0.2 * np.random.default_rng(1).standard_normal((8, 4)))
 CREEPING = replace(PLAIN, creep=CreepModel(TIME, AMPLITUDE))
@@ -56,10 +56,10 @@ def readings(time: np.ndarray, load: np.ndarray) -> np.ndarray:
 
 def rows_of(time: np.ndarray, pads: np.ndarray, cubes: int = 1) -> FrequencyRows:
     """Rows of the pads' readings (N, P) at times in s, the same for several cubes."""
-    frequency = pad_frequency(pads, PLAIN.rest_frequency, PLAIN.beta, PLAIN.modulus)
+    frequency = compute_pad_frequency(pads, PLAIN.rest_frequency, PLAIN.beta, PLAIN.modulus)
     stamp_ns = 10**9 + np.rint(1e9 * time).astype(np.int64)
     number = np.tile(np.arange(cubes, dtype=np.uint16), len(time))
-    return FrequencyRows.of(
+    return FrequencyRows.from_values(
         number, np.repeat(frequency, cubes, axis=0), stamp_ns=np.repeat(stamp_ns, cubes)
     )
 
@@ -163,7 +163,7 @@ def test_unknown_earlier_loads_are_a_deviation_that_decays():
         for row in range(len(rows)):
             found = reconstruct.process(rows.select(slice(row, row + 1)))
             error.append(abs(found.stress[0, 2] - load[chosen][row, 0]))
-            stated.append(np.sqrt(reconstruct.covariance(0)[2, 2]))
+            stated.append(np.sqrt(reconstruct.compute_covariance(0)[2, 2]))
             status.append(found.status[0] & (CREEP | COMPENSATION))
         error, stated = np.array(error)[is_late], np.array(stated)[is_late]
         assert (error < 1.5 * stated).all()

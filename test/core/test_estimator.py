@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from scipy.stats import chi2 as chi2_truth
 
-from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.calibration import make_illustrative_calibration
 from cube_tensor_driver.core.errors import SymmetryError
 from cube_tensor_driver.core.estimator import (
     FALSE_ALARM,
-    chi2_limit,
-    chi2_tail,
+    compute_chi2_limit,
+    compute_chi2_tail,
     make_estimator,
     summarize_response,
 )
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.modes import COMPONENTS, PLANE, SPACE
-from cube_tensor_driver.core.response import response
+from cube_tensor_driver.core.response import compute_response
 from cube_tensor_driver.core.symmetry import find_structure
 
 PAIRS = [
@@ -38,7 +38,7 @@ def random_case(layout: str, symmetry: str, seed: int = 0):
     structure = find_structure(LAYOUTS[layout], symmetry)
     rng = np.random.default_rng(seed)
     values = dict(zip(structure.names, rng.normal(size=structure.n_coefficients), strict=True))
-    return structure.modes, response(structure, values), rng
+    return structure.modes, compute_response(structure, values), rng
 
 
 def components_seen(estimator) -> set[str]:
@@ -106,7 +106,7 @@ def test_unequal_noise_weighs_the_pads():
 
 
 def test_what_the_layouts_see():
-    quad, planar, cube = (illustrative(n) for n in ("quad", "planar", "cube"))
+    quad, planar, cube = (make_illustrative_calibration(n) for n in ("quad", "planar", "cube"))
     see = {
         c.layout.name: components_seen(make_estimator(c.response, c.noise, c.modes))
         for c in (quad, planar, cube)
@@ -127,7 +127,7 @@ def test_what_the_layouts_see():
 
 
 def test_the_summary_of_a_layout():
-    c = illustrative("cube")
+    c = make_illustrative_calibration("cube")
     s = summarize_response(c.structure, c.response)
     keys = (
         "pads modes n_coefficients rank_uniform condition_uniform rank_gradient condition_gradient"
@@ -139,7 +139,7 @@ def test_the_summary_of_a_layout():
     assert s["noise"]["zz_z"] == pytest.approx(np.sqrt(whole.covariance[14, 14]))
     singular = np.linalg.svd(c.response[:, :6], compute_uv=False)
     assert s["condition_uniform"] == pytest.approx(singular[0] / singular[-1])
-    quad = illustrative("quad", ("xx", "xx_z", "xx_x"))
+    quad = make_illustrative_calibration("quad", ("xx", "xx_z", "xx_x"))
     s = summarize_response(quad.structure, quad.response, quad.neglect)
     assert s["rank_uniform"] == s["rank_gradient"] == 2 and s["unobservable"] == [
         "xx",
@@ -150,7 +150,7 @@ def test_the_summary_of_a_layout():
 
 
 def test_missing_pads_cost_what_they_must():
-    c = illustrative("planar")
+    c = make_illustrative_calibration("planar")
     one = make_estimator(c.response, c.noise, c.modes, missing=[2])
     assert components_seen(one) == set(PLANE.names) and one.dof == 0 and np.isnan(one.limit)
     assert np.all(one.matrix[one.observed, 2] == 0)
@@ -164,7 +164,7 @@ def test_missing_pads_cost_what_they_must():
 
 
 def test_a_nearly_hidden_mode_is_not_invented():
-    a = illustrative("planar").response.copy()
+    a = make_illustrative_calibration("planar").response.copy()
     a[:, PLANE.names.index("zx")] *= 1e-6
     estimator = make_estimator(a, np.ones(8), PLANE)
     assert components_seen(estimator) == set(PLANE.names) - {"zx"}
@@ -172,9 +172,9 @@ def test_a_nearly_hidden_mode_is_not_invented():
 
 @pytest.mark.parametrize("dof", range(1, 25))
 def test_chi_square_limits(dof):
-    assert chi2_limit(dof) == pytest.approx(chi2_truth.isf(FALSE_ALARM, dof), rel=1e-9)
-    assert chi2_tail(7.0, dof) == pytest.approx(chi2_truth.sf(7.0, dof), rel=1e-12)
-    assert chi2_tail(0.0, dof) == 1 and np.isnan(chi2_limit(0))
+    assert compute_chi2_limit(dof) == pytest.approx(chi2_truth.isf(FALSE_ALARM, dof), rel=1e-9)
+    assert compute_chi2_tail(7.0, dof) == pytest.approx(chi2_truth.sf(7.0, dof), rel=1e-12)
+    assert compute_chi2_tail(0.0, dof) == 1 and np.isnan(compute_chi2_limit(0))
 
 
 def opposite(layout) -> np.ndarray:
@@ -187,12 +187,12 @@ def suspects_after(sigmas: float, draws: int = 2000):
     """How often the residual rings, the suspects are exactly the broken pad and its opposite, miss
     the broken pad."""
     rng = np.random.default_rng(7)
-    c = illustrative("cube")
+    c = make_illustrative_calibration("cube")
     estimator = make_estimator(c.response, c.noise, c.modes)
     v = rng.normal(size=(draws, 21)) * 1e3 @ c.response.T + c.noise * rng.normal(size=(draws, 24))
     pad, row = rng.integers(24, size=draws), np.arange(draws)
     v[row, pad] += sigmas * c.noise[pad]
-    marked = estimator.suspects(v)
+    marked = estimator.find_suspects(v)
     pair = marked[row, pad] & marked[row, opposite(c.layout)[pad]] & (marked.sum(axis=1) == 2)
     return (
         np.mean(chi2_of(estimator, v) > estimator.limit),
@@ -211,15 +211,15 @@ def test_on_the_cube_a_broken_pad_is_named_up_to_its_opposite():
 
 def test_a_pad_cannot_be_told_from_its_opposite():
     """Their columns of U2' are equal: the difference of the two is a combination of gradients."""
-    c = illustrative("cube")
+    c = make_illustrative_calibration("cube")
     null = make_estimator(c.response, c.noise, c.modes).null
     np.testing.assert_allclose(null, null[:, opposite(c.layout)], atol=1e-12)
     assert len(np.unique(null.round(9), axis=1).T) == 12
 
 
 def test_on_the_planar_layout_the_residual_rings_but_names_nobody():
-    c = illustrative("planar")
+    c = make_illustrative_calibration("planar")
     estimator = make_estimator(c.response, c.noise, c.modes)
     broken = np.outer(50 * c.noise, np.ones(8)) * np.eye(8)
     assert np.all(chi2_of(estimator, broken) > estimator.limit)
-    assert not estimator.suspects(broken).any()
+    assert not estimator.find_suspects(broken).any()

@@ -14,10 +14,10 @@ from conftest import check, stamped
 from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core import status
-from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.calibration import make_illustrative_calibration
 from cube_tensor_driver.core.health.health import Health
 from cube_tensor_driver.core.health.statistics import WINDOW_S
-from cube_tensor_driver.core.oscillator import pad_frequency
+from cube_tensor_driver.core.oscillator import compute_pad_frequency
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.status import (
@@ -36,7 +36,7 @@ from cube_tensor_driver.simulation.cubes import SimulatedCubes
 from cube_tensor_driver.simulation.load import Load, default_script
 
 PERIOD_NS = 10_000_000  # 100 Hz
-CALIBRATION = illustrative("planar")
+CALIBRATION = make_illustrative_calibration("planar")
 NOISE = 8e-6
 
 
@@ -57,7 +57,9 @@ class Skin:
             2 * np.pi * 0.5 * self.row * 1e-9 * PERIOD_NS + phase[:, : CALIBRATION.modes.n_modes]
         )
         v = self._moving * state @ CALIBRATION.response.T
-        f = pad_frequency(v, CALIBRATION.rest_frequency, CALIBRATION.beta, CALIBRATION.modulus)
+        f = compute_pad_frequency(
+            v, CALIBRATION.rest_frequency, CALIBRATION.beta, CALIBRATION.modulus
+        )
         f *= 1 + self._noise * self._random.standard_normal((n, 8))
         return np.rint(f * 1e3) * 1e-3
 
@@ -88,8 +90,8 @@ def test_last_is_the_newest_row():
         )
         frequency += 1  # the caller's own, to fill again
         if n % 3 == 0:
-            assert (skin.health.sums.pads("last") == 100e3 + n).all()
-            assert (skin.health.window().rows == n).all()
+            assert (skin.health.sums.view_pads("last") == 100e3 + n).all()
+            assert (skin.health.read_window().rows == n).all()
 
 
 @pytest.mark.parametrize("moving", [True, False])
@@ -109,7 +111,9 @@ def test_a_load_that_moves_fast_is_no_noise(frequency):
     stress = np.where(np.eye(8) > 0, -20e3, -20e3 / 30)
     for row in range(300):
         v = stress * np.sin(2e-9 * np.pi * frequency * row * PERIOD_NS)
-        f = pad_frequency(v, CALIBRATION.rest_frequency, CALIBRATION.beta, CALIBRATION.modulus)
+        f = compute_pad_frequency(
+            v, CALIBRATION.rest_frequency, CALIBRATION.beta, CALIBRATION.modulus
+        )
         f = (f * (1 + NOISE * random.standard_normal(f.shape))).astype(np.float32)
         check(health, stamped(cube, f, np.zeros(8, np.uint32), np.full(8, row * PERIOD_NS)))
     assert not health.collect()[0].any()
@@ -150,7 +154,9 @@ def test_a_load_that_moves_under_stamps_in_doubt_is_no_noise():
         for row in range(250):
             at_s = 1e-9 * PERIOD_NS * row
             v = stress * np.sin(2 * np.pi * 0.5 * at_s)
-            f = pad_frequency(v, CALIBRATION.rest_frequency, CALIBRATION.beta, CALIBRATION.modulus)
+            f = compute_pad_frequency(
+                v, CALIBRATION.rest_frequency, CALIBRATION.beta, CALIBRATION.modulus
+            )
             f = (f * (1 + NOISE * random.standard_normal(8))).astype(np.float32)
             late_ns = int(random.integers(0, 8 * PERIOD_NS // 10)) if doubt else 0
             stamp_ns = [health.newest_ns + PERIOD_NS // 10 + late_ns]
@@ -177,7 +183,9 @@ class Press:
                 np.uint16
             )
             v = stress[cube] * np.sin(2 * np.pi * 0.5 * row * 1e-9 * PERIOD_NS)
-            f = pad_frequency(v, CALIBRATION.rest_frequency, CALIBRATION.beta, CALIBRATION.modulus)
+            f = compute_pad_frequency(
+                v, CALIBRATION.rest_frequency, CALIBRATION.beta, CALIBRATION.modulus
+            )
             f = (f * (1 + noise[cube] * self._random.standard_normal(f.shape))).astype(np.float32)
             jitter = self._random.integers(0, PERIOD_NS // 10, len(cube))
             check(
@@ -339,7 +347,7 @@ def test_many_rows_of_one_cube_take_bounded_time(first):
     left_out, _ = check(health, rows)
     assert time.perf_counter() - begun < 1.0  # 0.1 s; each row for itself takes 2.5 s
     assert not left_out.any()
-    assert health.window().rows.sum() == n and health.window().rows[first] >= 1
+    assert health.read_window().rows.sum() == n and health.read_window().rows[first] >= 1
 
 
 def test_a_cube_twice_in_a_batch_and_cubes_in_any_order():
@@ -353,8 +361,8 @@ def test_a_cube_twice_in_a_batch_and_cubes_in_any_order():
     for row in range(6):
         one = slice(row, row + 1)
         check(singly, stamped(cube[one], frequency[one], none[one], 0))
-    np.testing.assert_array_equal(together.sums.pads("last"), singly.sums.pads("last"))
-    for one, other in zip(together.window(), singly.window(), strict=True):
+    np.testing.assert_array_equal(together.sums.view_pads("last"), singly.sums.view_pads("last"))
+    for one, other in zip(together.read_window(), singly.read_window(), strict=True):
         np.testing.assert_array_equal(one, other)
     assert together.collect()[2].tolist() == [1, 2, 0, 0, 3, 0]
 
@@ -368,14 +376,14 @@ def test_a_jump_back_in_time_begins_a_new_window():
     skin.health.sums.cubes["over_limit"] = 50
     skin.row = 0
     skin.play(0.1)
-    assert skin.health.window().rows.tolist() == [10] * 6
+    assert skin.health.read_window().rows.tolist() == [10] * 6
     skin.play(0.5)
     assert skin.health.closed == before + 1 and skin.health.history[-1].rows.max() == 50
     assert skin.health.newest_ns == 59 * PERIOD_NS
 
 
 def test_mixed_layouts_and_pads_that_do_not_exist():
-    pipeline = Pipeline([illustrative("quad"), CALIBRATION], np.float32)
+    pipeline = Pipeline([make_illustrative_calibration("quad"), CALIBRATION], np.float32)
     watch = Health(pipeline)
     frequency = np.full((2, 8), 100e3, np.float32)
     frequency[0, 4:] = np.nan

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 
 from conftest import ROOT
 from cube_tensor_driver.core import pipeline
-from cube_tensor_driver.core.calibration import Calibration, illustrative
+from cube_tensor_driver.core.calibration import Calibration, make_illustrative_calibration
 from cube_tensor_driver.core.compensation.models import CreepModel, ThermalModel, WeightModel
 from cube_tensor_driver.core.kernel import run
 from cube_tensor_driver.core.oscillator import TemperatureModel
@@ -132,7 +132,9 @@ def kernel(request, tmp_path_factory) -> Iterator[object]:
 def individual(layout: str, seed: int, **changes) -> Calibration:
     """A calibration whose pads all differ."""
     rng = np.random.default_rng(seed)
-    whole = illustrative(layout, ("xx", "xx_z", "xx_x") if layout == "quad" else ())
+    whole = make_illustrative_calibration(
+        layout, ("xx", "xx_z", "xx_x") if layout == "quad" else ()
+    )
     n = whole.layout.n_pads
     return replace(
         whole,
@@ -146,7 +148,7 @@ def individual(layout: str, seed: int, **changes) -> Calibration:
 
 
 def thermal(layout: str, seed: int, degree: int) -> Calibration:
-    n_pads = illustrative(layout).layout.n_pads
+    n_pads = make_illustrative_calibration(layout).layout.n_pads
     slopes = 1e-4 * np.random.default_rng(seed).normal(size=(n_pads, degree))
     return individual(layout, seed, temperature=TemperatureModel(24.0, slopes))
 
@@ -167,17 +169,17 @@ def lasting(calibration: Calibration, seed: int) -> Calibration:
 
 
 SKINS = {
-    "planar": [illustrative("planar")] * 9,
+    "planar": [make_illustrative_calibration("planar")] * 9,
     "mixed": [
         heavy(individual("cube", 8), 9),
         lasting(thermal("cube", 1, 2), 3),
         lasting(heavy(individual("planar", 12), 4), 5),
         *(individual("planar", seed) for seed in range(4)),
         individual("quad", 6),
-        replace(illustrative("planar"), beta=np.array(0.0)),
+        replace(make_illustrative_calibration("planar"), beta=np.array(0.0)),
         thermal("planar", 7, 1),
     ],
-    "quad": [lasting(heavy(illustrative("quad"), 2), 3)] * 3,
+    "quad": [lasting(heavy(make_illustrative_calibration("quad"), 2), 3)] * 3,
 }
 """Skins of all layouts: of one calibration, of many, with temperature, weight and creep, and
 without a residual."""
@@ -216,7 +218,7 @@ def played_rows(calibrations, seed: int, dtype) -> Iterator[tuple[FrequencyRows,
         force = 9.81 * rng.normal(size=(n, 3))
         force[rng.random(n) < chance] = np.nan
         with np.errstate(all="ignore"):
-            rows = FrequencyRows.of(
+            rows = FrequencyRows.from_values(
                 cube.astype(np.uint16),
                 frequency.astype(dtype),
                 stamp_ns=stamp_ns,
@@ -251,7 +253,7 @@ def played(kernel, calibrations, seed: int, dtype=np.float32) -> list[object]:
                 health.state,
                 health.sums.cubes["mask"].copy(),
                 *health.collect(),
-                *health.window(),
+                *health.read_window(),
             ]
         found += [column for window in health.history for column in window]
         found += [health.sums.cubes[name] for name in health.sums.cubes.dtype.names]

@@ -10,10 +10,14 @@ import numpy as np
 import pytest
 
 from conftest import samples
-from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.calibration import make_illustrative_calibration
 from cube_tensor_driver.core.errors import CalibrationError, CubeError, LayoutError
 from cube_tensor_driver.core.estimator import make_estimator
-from cube_tensor_driver.core.oscillator import TemperatureModel, pad_frequency, pad_stress
+from cube_tensor_driver.core.oscillator import (
+    TemperatureModel,
+    compute_pad_frequency,
+    compute_pad_stress,
+)
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import StressRows
 from cube_tensor_driver.core.status import INVALID, PAD_FAULT, RESIDUAL, TEMPERATURE
@@ -26,7 +30,7 @@ def individual(layout: str, seed: int, **changes):
     """An illustrative calibration whose pads all differ."""
     rng, c = (
         np.random.default_rng(seed),
-        illustrative(layout, QUAD_NEGLECT if layout == "quad" else ()),
+        make_illustrative_calibration(layout, QUAD_NEGLECT if layout == "quad" else ()),
     )
     n = c.layout.n_pads
     return dataclasses.replace(
@@ -41,7 +45,7 @@ def individual(layout: str, seed: int, **changes):
 
 
 def frequencies(calibration, states):
-    return pad_frequency(
+    return compute_pad_frequency(
         states @ calibration.response.T,
         calibration.rest_frequency,
         calibration.beta,
@@ -55,7 +59,7 @@ def truth(calibration, states):
 
 def states_of(calibration, count, seed=0):
     states = 1e3 * np.random.default_rng(seed).normal(size=(count, calibration.modes.n_modes))
-    states[:, calibration.modes.index(calibration.neglect)] = 0
+    states[:, calibration.modes.find_indices(calibration.neglect)] = 0
     return states
 
 
@@ -77,12 +81,12 @@ def check_rows(rows, expected, tolerance):
 
 @pytest.mark.parametrize("dtype, tolerance", DTYPES)
 @pytest.mark.parametrize("layout", ["quad", "planar", "cube"])
-@pytest.mark.parametrize("make", [illustrative, individual])
+@pytest.mark.parametrize("make", [make_illustrative_calibration, individual])
 def test_recovers_the_applied_fields(layout, make, dtype, tolerance):
     c = (
         make(layout, 3)
         if make is individual
-        else illustrative(layout, QUAD_NEGLECT if layout == "quad" else ())
+        else make_illustrative_calibration(layout, QUAD_NEGLECT if layout == "quad" else ())
     )
     states = states_of(c, 50)
     rows = Pipeline([c] * 50, dtype).process(
@@ -118,19 +122,19 @@ def test_cubes_of_all_kinds_in_one_batch(dtype, tolerance):
     assert np.isnan(rows.residual[cube == 4]).all() and np.all(
         rows.residual[cube != 4][[0, 1, 2, 4, 5]] < 0.1
     )
-    pads = pipeline.pad_stress(samples(cube, frequency))
+    pads = pipeline.compute_pad_stress(samples(cube, frequency))
     assert np.isnan(pads[0, 4:]).all() and np.isfinite(pads[2]).all()
     k = kinds[0]
     np.testing.assert_allclose(
         pads[1, :8],
-        pad_stress(frequency[1, :8], k.rest_frequency, k.beta, k.modulus),
+        compute_pad_stress(frequency[1, :8], k.rest_frequency, k.beta, k.modulus),
         atol=0.2 if dtype == np.float32 else 1e-8,
     )
 
 
 @pytest.mark.parametrize("dtype, tolerance", DTYPES)
 def test_pads_without_parasitic_capacitance(dtype, tolerance):
-    c = dataclasses.replace(illustrative("planar"), beta=np.array(0.0))
+    c = dataclasses.replace(make_illustrative_calibration("planar"), beta=np.array(0.0))
     states = states_of(c, 20)
     frequency = frequencies(c, states)
     frequency[19, 0] = np.inf
@@ -163,7 +167,7 @@ def test_bad_pads_are_left_out(dtype, tolerance):
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 0.0, -1e5, 1e5 * 1.3 / 0.3, 5e5])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_one_bad_frequency_alone_is_found(value, dtype):
-    c = illustrative("cube")
+    c = make_illustrative_calibration("cube")
     frequency = np.full((3, 24), 1e5)
     frequency[1, 2] = value
     rows = Pipeline([c] * 3, dtype).process(samples(np.arange(3), frequency))
@@ -172,7 +176,7 @@ def test_one_bad_frequency_alone_is_found(value, dtype):
 
 
 def test_what_the_remaining_pads_cannot_see_is_not_invented():
-    c = illustrative("planar")
+    c = make_illustrative_calibration("planar")
     frequency = frequencies(c, states_of(c, 1))
     for bits in range(256):
         rows = Pipeline([c]).process(samples(np.array([0]), frequency, np.array([bits])))
@@ -184,7 +188,7 @@ def test_what_the_remaining_pads_cannot_see_is_not_invented():
 
 
 def test_strange_rows_end_in_their_status_never_in_an_error():
-    c = illustrative("planar")
+    c = make_illustrative_calibration("planar")
     pipeline = Pipeline([c] * 3)
     good = frequencies(c, states_of(c, 1))[0]
     rows = pipeline.process(samples(np.array([0, -1, 3, 2]), np.tile(good, (4, 1))))
@@ -206,7 +210,7 @@ def test_strange_rows_end_in_their_status_never_in_an_error():
 
 
 def test_wrong_shapes_and_settings_are_errors():
-    c = illustrative("planar")
+    c = make_illustrative_calibration("planar")
     pipeline = Pipeline([c] * 2)
     with pytest.raises(LayoutError, match=r"\(2, 4\).*\(N, 8\)"):
         pipeline.process(samples(np.arange(2), np.ones((2, 4))))
@@ -221,19 +225,19 @@ def test_wrong_shapes_and_settings_are_errors():
 
 
 def test_the_residual_rings_for_what_no_field_explains():
-    c = illustrative("planar")
+    c = make_illustrative_calibration("planar")
     v = states_of(c, 2) @ c.response.T
     v[1, 0] += 30 * c.noise[0]
-    frequency = pad_frequency(v, 1e5, c.beta, c.modulus)
+    frequency = compute_pad_frequency(v, 1e5, c.beta, c.modulus)
     rows = Pipeline([c]).process(samples(np.zeros(2, int), frequency))
     assert rows.status.tolist() == [0, RESIDUAL]
     assert rows.residual[1] == pytest.approx(30 / np.sqrt(8))  # all eight pads check it alike
-    cube = illustrative("cube")
+    cube = make_illustrative_calibration("cube")
     v = states_of(cube, 2) @ cube.response.T
     v[1, 5] += 50 * cube.noise[5]
     pipeline = Pipeline([cube])
-    marked = pipeline.suspects(
-        samples(np.zeros(2, int), pad_frequency(v, 1e5, cube.beta, cube.modulus))
+    marked = pipeline.find_suspects(
+        samples(np.zeros(2, int), compute_pad_frequency(v, 1e5, cube.beta, cube.modulus))
     )
     assert not marked[0].any() and {cube.layout.pads[i] for i in np.flatnonzero(marked[1])} == {
         "+x+z",
@@ -242,20 +246,20 @@ def test_the_residual_rings_for_what_no_field_explains():
 
 
 def test_false_alarms_are_as_stated():
-    c = illustrative("planar")
+    c = make_illustrative_calibration("planar")
     rng = np.random.default_rng(2)
     frequency = 1e5 * (1 + 8e-6 * rng.normal(size=(200_000, 8)))
     rows = Pipeline([c], np.float64).process(samples(np.zeros(200_000, int), frequency))
     assert np.mean(rows.status == RESIDUAL) == pytest.approx(1e-3, abs=4 * np.sqrt(1e-3 / 2e5))
     assert np.sqrt(np.mean(rows.residual**2)) == pytest.approx(1, rel=0.01)
-    stated = np.sqrt(np.diag(Pipeline([c]).covariance(0)))
+    stated = np.sqrt(np.diag(Pipeline([c]).compute_covariance(0)))
     scatter = joined(rows).std(axis=0)
     seen = np.isfinite(stated)
     np.testing.assert_allclose(scatter[seen], stated[seen], rtol=0.03)
 
 
 def test_tare_moves_the_rest_frequency():
-    c = illustrative("planar")
+    c = make_illustrative_calibration("planar")
     pipeline = Pipeline([c] * 2)
     drifted = np.array([[1e5] * 8, np.linspace(1.01e5, 1.02e5, 8)])
     assert np.abs(pipeline.process(samples(np.arange(2), drifted)).stress[1, 2]) > 1e3
@@ -269,13 +273,13 @@ def test_tare_moves_the_rest_frequency():
 def test_the_temperature_model_is_taken_out():
     model = TemperatureModel(25, np.outer(np.linspace(-1, 1, 8), [1e-3, 1e-5]))
     c, plain = (
-        dataclasses.replace(illustrative("planar"), temperature=model),
-        illustrative("planar"),
+        dataclasses.replace(make_illustrative_calibration("planar"), temperature=model),
+        make_illustrative_calibration("planar"),
     )
     states = states_of(c, 4)
     warm = np.array([40.0, np.nan, 25.0, 10.0])
     frequency = frequencies(c, states)
-    frequency[[0, 3]] *= model.factor(warm[[0, 3]])
+    frequency[[0, 3]] *= model.compute_factor(warm[[0, 3]])
     pipeline = Pipeline([c, plain])
     rows = pipeline.process(samples(np.array([0, 0, 0, 0]), frequency, None, warm))
     check_rows(rows, truth(c, states), 1e-9)
@@ -283,16 +287,19 @@ def test_the_temperature_model_is_taken_out():
     mixed = pipeline.process(samples(np.array([1, 0]), frequencies(c, states[:2])))
     assert mixed.status.tolist() == [0, TEMPERATURE]
     factor = pipeline.compute_unloaded_factor(np.array([0, 1]), np.array([40.0, 40.0]))
-    np.testing.assert_allclose(factor, [model.factor([40.0])[0], np.ones(8)])
+    np.testing.assert_allclose(factor, [model.compute_factor([40.0])[0], np.ones(8)])
 
 
 def test_covariance_of_a_cube_with_a_bad_pad():
     c = individual("planar", 5)
-    pipeline = Pipeline([illustrative("quad"), c])
-    whole, less = np.diag(pipeline.covariance(1)), np.diag(pipeline.covariance(1, 1))
+    pipeline = Pipeline([make_illustrative_calibration("quad"), c])
+    whole, less = (
+        np.diag(pipeline.compute_covariance(1)),
+        np.diag(pipeline.compute_covariance(1, 1)),
+    )
     seen = np.isfinite(whole)
     assert np.all(less[seen] >= whole[seen] * (1 - 1e-9)) and np.isnan(
-        np.diag(pipeline.covariance(0))[0]
+        np.diag(pipeline.compute_covariance(0))[0]
     )
     alone = make_estimator(c.response, c.noise, c.modes).covariance
     np.testing.assert_allclose(whole[6:], np.diag(alone)[6:] / c.half_side**2)
@@ -361,7 +368,8 @@ def test_absent_pads_are_no_bad_pads():
 
     def calls(layouts: list[str]) -> int:
         pipeline = Pipeline(
-            [illustrative(layouts[k * len(layouts) // 1024]) for k in range(1024)], np.float32
+            [make_illustrative_calibration(layouts[k * len(layouts) // 1024]) for k in range(1024)],
+            np.float32,
         )
         cube = np.arange(1024, dtype=np.uint16)
         f = (0.99 * pipeline.rest_frequency).astype(np.float32)

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from conftest import check, stamped
-from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.calibration import make_illustrative_calibration
 from cube_tensor_driver.core.health.health import Health
 from cube_tensor_driver.core.health.statistics import clear_sums
 from cube_tensor_driver.core.pipeline import Pipeline
@@ -15,7 +15,7 @@ from cube_tensor_driver.core.reconstructor import Reconstructor, RecordedHealth
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.core.status import PAD_FAULT, SHORT, STAMP, STUCK
 
-CALIBRATION = illustrative("planar")
+CALIBRATION = make_illustrative_calibration("planar")
 
 
 def test_noise_of_a_window_is_the_deviation_of_white_noise():
@@ -29,7 +29,7 @@ def test_noise_of_a_window_is_the_deviation_of_white_noise():
         check(health, stamped(cube, f[row], 0, 4_000_000 * (row + 1)))
         if row == 2:
             clear_sums(health.sums)
-    noise = np.sqrt(np.mean(health.window().noise ** 2))
+    noise = np.sqrt(np.mean(health.read_window().noise ** 2))
     # float32 rounds 1e5 Hz to 1/128 Hz, which adds 0.005 % here
     np.testing.assert_allclose(noise, deviation, rtol=4e-3)
 
@@ -43,7 +43,7 @@ def frequencies() -> np.ndarray:
 def test_doubt_of_a_stamp_goes_with_the_row():
     """Nothing else that a peer writes there does."""
     doubt = np.array([STAMP, STAMP | STUCK])
-    rows = FrequencyRows.of(np.arange(2), frequencies(), status=doubt)
+    rows = FrequencyRows.from_values(np.arange(2), frequencies(), status=doubt)
     reconstruct = Reconstructor([CALIBRATION] * 2)
     assert reconstruct(rows).status.tolist() == [STAMP, STAMP | PAD_FAULT | SHORT]
     recorded = RecordedHealth(np.ones(2, bool), np.zeros(2, np.uint32), np.zeros(2, np.uint16))

@@ -27,7 +27,7 @@ def rows_at(stamp_ns) -> FrequencyRows:
     """One row at each time; every tenth is of a cube that the skin does not have."""
     n = np.arange(len(stamp_ns))
     cube = np.where(n % 10 == 9, CUBES, n % CUBES).astype(np.uint16)
-    return FrequencyRows.of(cube, np.zeros((len(n), 1), np.float32), stamp_ns=stamp_ns)
+    return FrequencyRows.from_values(cube, np.zeros((len(n), 1), np.float32), stamp_ns=stamp_ns)
 
 
 @pytest.mark.skipif(run.native is None, reason="the module _scan is not built")

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from conftest import check, samples, stamped
-from cube_tensor_driver.config.tare import read_tare, remove_tare, tare_path, write_tare
-from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.config.tare import find_tare_path, read_tare, remove_tare, write_tare
+from cube_tensor_driver.core.calibration import make_illustrative_calibration
 from cube_tensor_driver.core.errors import ConfigError, TareError
 from cube_tensor_driver.core.health.diagnosis import HOLD_WINDOWS
 from cube_tensor_driver.core.health.drift import DriftTracker
@@ -23,7 +23,7 @@ from cube_tensor_driver.core.health.tare import measure_rest
 from cube_tensor_driver.core.oscillator import TemperatureModel
 from cube_tensor_driver.core.pipeline import Pipeline
 
-CALIBRATION = illustrative("planar")
+CALIBRATION = make_illustrative_calibration("planar")
 NAMES = ["a", "b", "c"]
 RATE, NOISE = 40, 8e-6
 NOW = datetime(2026, 1, 2, 3, 4, 5, tzinfo=timezone.utc)
@@ -242,8 +242,10 @@ def test_a_steady_load_survives_an_hour_of_drift_tracking_and_drift_does_not():
     skin.play(hour, frequency, time_constant=60.0)
     rest, now = skin.pipeline.rest_frequency, frequency(skin.seconds)
     np.testing.assert_allclose(rest[0], 100e3, rtol=3 * NOISE)
-    stress = skin.pipeline.pad_stress(samples(np.arange(3), now))
-    true = Skin().pipeline.pad_stress(samples(np.arange(3), np.tile(100e3 * (1 + load), (3, 1))))[0]
+    stress = skin.pipeline.compute_pad_stress(samples(np.arange(3), now))
+    true = Skin().pipeline.compute_pad_stress(
+        samples(np.arange(3), np.tile(100e3 * (1 + load), (3, 1)))
+    )[0]
     np.testing.assert_allclose(stress[0], true, atol=3 * 3.2)  # the pads' noise is 3.1 Pa
     # a follower of time constant τ lags behind a ramp by rate · τ = 20 ppm
     np.testing.assert_allclose(rest[1], now[1] * (1 - 20e-6), rtol=10e-6)
@@ -313,7 +315,7 @@ def test_file_round_trip_and_what_does_not_fit(tmp_path):
     other = illustrative_with(TemperatureModel(25.0, np.full((8, 1), 1e-5)))
     with pytest.raises(ConfigError, match=f"{CALIBRATION.id}.*{other.id}"):
         read_tare(tmp_path / "deep", 7, other)
-    tare_path(tmp_path / "deep", 7).rename(tare_path(tmp_path / "deep", 8))
+    find_tare_path(tmp_path / "deep", 7).rename(find_tare_path(tmp_path / "deep", 8))
     with pytest.raises(ConfigError, match="0x7"):
         read_tare(tmp_path / "deep", 8, CALIBRATION)
     remove_tare(tmp_path / "deep", 8)
@@ -342,7 +344,7 @@ def test_a_file_is_held_to_the_limit_of_the_service(tmp_path, hertz):
 def test_damaged_files_are_our_errors(tmp_path_factory, data):
     folder = tmp_path_factory.mktemp("tare")
     write_tare(folder, 7, CALIBRATION, pads()[0], NOW)
-    path = tare_path(folder, 7)
+    path = find_tare_path(folder, 7)
     content = bytearray(path.read_bytes())
     for _ in range(data.draw(st.integers(1, 8))):
         at = data.draw(st.integers(0, len(content) - 1))

@@ -16,16 +16,16 @@ from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.rows import StressRows
 from cube_tensor_driver.core.symmetry import find_group
 from cube_tensor_driver.core.tensor import (
-    contact_wrench,
-    invariants,
-    principal_stresses,
+    compute_contact_wrench,
+    compute_invariants,
+    compute_principal_stresses,
+    compute_traction,
+    compute_von_mises,
     quaternion_from_rpy,
     rotate_gradient,
     rotate_stress,
     rotation_from_quaternion,
     rotation_from_rpy,
-    traction,
-    von_mises,
 )
 
 ANGLES = st.tuples(*[st.floats(-3.1, 3.1)] * 3)
@@ -34,16 +34,20 @@ STRESS = RNG.normal(size=(20, 6))
 
 
 def test_principal_stresses_are_tractions_along_their_directions():
-    values, directions = principal_stresses(STRESS)
+    values, directions = compute_principal_stresses(STRESS)
     assert np.all(np.diff(values, axis=1) <= 0)
     for k in range(3):
         np.testing.assert_allclose(
-            traction(STRESS, directions[:, k]), values[:, k, None] * directions[:, k], atol=1e-12
+            compute_traction(STRESS, directions[:, k]),
+            values[:, k, None] * directions[:, k],
+            atol=1e-12,
         )
     np.testing.assert_allclose(
         directions @ directions.transpose(0, 2, 1), np.tile(np.eye(3), (20, 1, 1)), atol=1e-12
     )
-    values, directions = principal_stresses(np.array([[np.nan, 0, 0, 0, 0, 0], [1, 2, 3, 0, 0, 0]]))
+    values, directions = compute_principal_stresses(
+        np.array([[np.nan, 0, 0, 0, 0, 0], [1, 2, 3, 0, 0, 0]])
+    )
     assert (
         np.isnan(values[0]).all()
         and np.isnan(directions[0]).all()
@@ -52,23 +56,29 @@ def test_principal_stresses_are_tractions_along_their_directions():
 
 
 def test_invariants_are_those_of_the_principal_stresses():
-    a, b, c = principal_stresses(STRESS)[0].T
+    a, b, c = compute_principal_stresses(STRESS)[0].T
     np.testing.assert_allclose(
-        invariants(STRESS), np.stack([a + b + c, a * b + b * c + c * a, a * b * c], 1), atol=1e-12
+        compute_invariants(STRESS),
+        np.stack([a + b + c, a * b + b * c + c * a, a * b * c], 1),
+        atol=1e-12,
     )
     np.testing.assert_allclose(
-        von_mises(STRESS), np.sqrt(((a - b) ** 2 + (b - c) ** 2 + (c - a) ** 2) / 2), atol=1e-12
+        compute_von_mises(STRESS),
+        np.sqrt(((a - b) ** 2 + (b - c) ** 2 + (c - a) ** 2) / 2),
+        atol=1e-12,
     )
-    assert von_mises(np.array([5.0, 0, 0, 0, 0, 0])) == 5  # uniaxial
-    assert von_mises(np.array([0, 0, 0, 0, 2.0, 0])) == pytest.approx(2 * np.sqrt(3))  # shear
+    assert compute_von_mises(np.array([5.0, 0, 0, 0, 0, 0])) == 5  # uniaxial
+    assert compute_von_mises(np.array([0, 0, 0, 0, 2.0, 0])) == pytest.approx(
+        2 * np.sqrt(3)
+    )  # shear
 
 
 def test_traction_on_the_faces_is_a_column():
     s = np.array([1.0, 2, 3, 4, 5, 6])  # xx yy zz yz zx xy
-    assert traction(s, [0, 0, 7]).tolist() == [5, 4, 3]
-    assert traction(s, [-1, 0, 0]).tolist() == [-1, -6, -5]
+    assert compute_traction(s, [0, 0, 7]).tolist() == [5, 4, 3]
+    assert compute_traction(s, [-1, 0, 0]).tolist() == [-1, -6, -5]
     with pytest.raises(CubeError, match="length 0"):
-        traction(s, [0, 0, 0])
+        compute_traction(s, [0, 0, 0])
 
 
 @given(ANGLES, ANGLES)
@@ -85,7 +95,7 @@ def test_rotations_compose(one, two):
     )
     np.testing.assert_allclose(rotate_stress(rotate_stress(STRESS, r1), r1.T), STRESS, atol=1e-12)
     np.testing.assert_allclose(
-        invariants(rotate_stress(STRESS, r1)), invariants(STRESS), atol=1e-10
+        compute_invariants(rotate_stress(STRESS, r1)), compute_invariants(STRESS), atol=1e-10
     )
 
 
@@ -103,7 +113,7 @@ def test_a_turned_field_is_the_field_at_the_turned_point(rpy):
 def test_rotations_agree_with_the_groups_action():
     state = RNG.normal(size=21)
     for r in find_group("full")[::5]:
-        rotated = SPACE.action(r) @ state
+        rotated = SPACE.compute_action(r) @ state
         stress, gradient = (
             rotated @ to_voigt(SPACE.stress),
             np.tensordot(rotated, SPACE.gradient, 1),
@@ -147,12 +157,12 @@ def test_the_wrench_is_the_integral_over_the_face():
     x, y = np.meshgrid(at, at, indexing="ij")
     zz = 3 + gradient[0, 6] * x + gradient[0, 7] * y
     area = (side / n) ** 2
-    force, torque = contact_wrench(stress, gradient, side)
+    force, torque = compute_contact_wrench(stress, gradient, side)
     np.testing.assert_allclose(force[0], [5 * side**2, 4 * side**2, zz.sum() * area])
     np.testing.assert_allclose(
         torque[0], [(y * zz).sum() * area, -(x * zz).sum() * area, 0], rtol=1e-4
     )
-    force, torque = contact_wrench(np.full((1, 6), np.nan), np.full((1, 9), np.nan), side)
+    force, torque = compute_contact_wrench(np.full((1, 6), np.nan), np.full((1, 9), np.nan), side)
     assert not force.any() and not torque.any()
 
 
@@ -164,19 +174,19 @@ def test_forces_are_the_traction_of_the_parents_stress_on_each_turned_face():
     skin = SimpleNamespace(poses=CubePoses(RNG.normal(size=(20, 3)), turned, side / 2))
     parent = STRESS[0]
     seen = np.array([rotate_stress(parent, rotation.T) for rotation in turned])
-    expected = side[:, None] ** 2 * traction(parent, turned[:, :, 2])
+    expected = side[:, None] ** 2 * compute_traction(parent, turned[:, :, 2])
     order = RNG.permutation(20)
-    rows = StressRows.of(order, seen[order], np.zeros((20, 9)))
+    rows = StressRows.from_values(order, seen[order], np.zeros((20, 9)))
     np.testing.assert_allclose(Forces(skin)(rows), expected[order], atol=1e-15)
     whole = Forces(skin, side=0.01)(rows)
     np.testing.assert_allclose(whole, (0.01 / side[order, None]) ** 2 * expected[order], atol=1e-15)
 
     # the last row of each cube; a cube without one, and one that observes nothing, have NaN
     blind = np.where(np.arange(20)[:, None] == 4, np.nan, seen[:19][np.arange(20) % 19])
-    rows = StressRows.of(np.arange(20) % 19, blind, np.zeros((20, 9)))
-    force = Forces(skin).of_skin(rows)
+    rows = StressRows.from_values(np.arange(20) % 19, blind, np.zeros((20, 9)))
+    force = Forces(skin).compute_in_parent_frame(rows)
     assert np.flatnonzero(np.isnan(force).any(axis=1)).tolist() == [4, 19]
     np.testing.assert_allclose(force[0], expected[0], atol=1e-15)
     flat = SimpleNamespace(poses=CubePoses(np.zeros((1, 3)), np.eye(3)[None], side[:1] / 2))
-    planar = StressRows.of([0], [[1, np.nan, -3, np.nan, 2, np.nan]], np.zeros((1, 9)))
+    planar = StressRows.from_values([0], [[1, np.nan, -3, np.nan, 2, np.nan]], np.zeros((1, 9)))
     np.testing.assert_allclose(Forces(flat)(planar), [np.array([2, 0, -3]) * side[0] ** 2])

@@ -17,7 +17,7 @@ from cube_tensor_driver.core.compensation.models import ThermalModel
 from cube_tensor_driver.core.compensation.thermal import LOST_KELVIN, START_KELVIN
 from cube_tensor_driver.core.errors import CalibrationError, LayoutError
 from cube_tensor_driver.core.layout import LAYOUTS
-from cube_tensor_driver.core.oscillator import pad_frequency
+from cube_tensor_driver.core.oscillator import compute_pad_frequency
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows, concatenate
 from cube_tensor_driver.core.status import COMPENSATION, THERMAL
@@ -53,8 +53,8 @@ def unloaded(seconds: np.ndarray, lag: list[float], quadratic: float = 0.0) -> F
     assert PLANAR is not None
     u = reading(seconds, lag)[:, None]
     stress = LINEAR * (u + quadratic * u * u)
-    hertz = pad_frequency(stress, PLANAR.rest_frequency, PLANAR.beta, PLANAR.modulus)
-    return FrequencyRows.of(
+    hertz = compute_pad_frequency(stress, PLANAR.rest_frequency, PLANAR.beta, PLANAR.modulus)
+    return FrequencyRows.from_values(
         np.zeros(len(seconds), np.uint16),
         hertz,
         stamp_ns=np.round(seconds * 1e9).astype(np.int64) + 10**18,
@@ -105,7 +105,7 @@ def test_parts_and_a_restored_state_give_the_same_bits():
     assert concatenate(found).stress.tobytes() == expected.stress.tobytes()
     # Two cubes in one scan, then the same as single scans.
     two = [calibration([97.0, 21.0]), calibration([50.0])]
-    both = FrequencyRows.of(
+    both = FrequencyRows.from_values(
         np.tile([0, 1], len(rows)).astype(np.uint16),
         np.repeat(rows.frequency, 2, axis=0),
         stamp_ns=np.repeat(rows.stamp_ns, 2),
@@ -124,7 +124,7 @@ def test_the_deviation_grows_while_the_elastomer_lags_and_a_bit_says_so():
     reconstruct = Reconstructor([calibration(lag, ramp=ramp, deviation=deviation)], np.float64)
     times = np.concatenate([np.arange(0.0, 600.0), [600.0]])
     rows = unloaded(times, lag)
-    matrix, noise = reconstruct.pipeline.matrix(0), reconstruct.pipeline.covariance(0)
+    matrix, noise = reconstruct.pipeline.find_matrix(0), reconstruct.pipeline.compute_covariance(0)
     u = reading(times, lag)
     flagged = []
     for number in range(len(rows)):
@@ -135,7 +135,9 @@ def test_the_deviation_grows_while_the_elastomer_lags_and_a_bit_says_so():
         patterns = np.column_stack([start * LINEAR, behind * ramp, u[number] * deviation])
         if number in (0, 99, 130, 400):
             expected = noise + matrix @ patterns @ patterns.T @ matrix.T
-            np.testing.assert_allclose(reconstruct.covariance(0), expected, rtol=1e-5, atol=1e-3)
+            np.testing.assert_allclose(
+                reconstruct.compute_covariance(0), expected, rtol=1e-5, atol=1e-3
+            )
     # 1 K of an unknown start is 140 Pa; 10 K behind are 70 Pa; both are above 30 Pa.
     assert flagged[0]
     assert all(flagged[115:140]) and not any(flagged[450:])
@@ -149,8 +151,8 @@ def test_an_unknown_temperature_is_a_stated_deviation():
     reconstruct = Reconstructor([calibration([97.0])], np.float64)
     never = reconstruct.process(replace(rows, temperature=np.full(len(rows), np.nan)))
     assert (never.status & (COMPENSATION | THERMAL) == COMPENSATION).all()
-    growth = reconstruct.covariance(0) - reconstruct.pipeline.covariance(0)
-    expected = reconstruct.pipeline.matrix(0) @ LINEAR * LOST_KELVIN
+    growth = reconstruct.compute_covariance(0) - reconstruct.pipeline.compute_covariance(0)
+    expected = reconstruct.pipeline.find_matrix(0) @ LINEAR * LOST_KELVIN
     np.testing.assert_allclose(growth, np.outer(expected, expected), rtol=1e-9, atol=1e-6)
 
     # A thermometer that fails: the last temperature is kept, and 5 K are approached with the lag.
@@ -160,8 +162,8 @@ def test_an_unknown_temperature_is_a_stated_deviation():
     found = reconstruct.process(lost)
     share = 1 - np.exp(-120 / 97)
     unknown = START_KELVIN * np.exp(-199.5 / 97) + LOST_KELVIN * share
-    growth = reconstruct.covariance(0) - reconstruct.pipeline.covariance(0)
-    expected = reconstruct.pipeline.matrix(0) @ LINEAR * unknown
+    growth = reconstruct.compute_covariance(0) - reconstruct.pipeline.compute_covariance(0)
+    expected = reconstruct.pipeline.find_matrix(0) @ LINEAR * unknown
     assert growth[0, 0] == pytest.approx(expected[0] ** 2, rel=1e-3)
     assert found.status[-1] & COMPENSATION
 

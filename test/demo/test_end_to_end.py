@@ -256,7 +256,7 @@ def test_every_topic_of_a_skin(ros, tmp_path):
     normal, shear = tensor.tensor.normal, tensor.tensor.shear
     np.testing.assert_array_equal([normal.x, normal.y, normal.z, shear.x, shear.y, shear.z], stress)
     assert tensor.header.frame_id == "skin_c05"
-    expected = Reconstructor(skin).covariance(5)
+    expected = Reconstructor(skin).compute_covariance(5)
     np.testing.assert_allclose(
         np.reshape(tensor.tensor.covariance, (15, 15)), expected, rtol=1e-5
     )  # noise in float32
@@ -274,7 +274,7 @@ def test_every_topic_of_a_skin(ros, tmp_path):
     assert cloud.header.frame_id == "skin_base" and cloud.width == 16
     points = np.frombuffer(cloud.data, "<f4").reshape(16, 6)
     np.testing.assert_allclose(points[:, :3], [cube.xyz for cube in skin.cubes], rtol=1e-6)
-    expected = Forces(skin).of_skin(decoded(batch).rows)
+    expected = Forces(skin).compute_in_parent_frame(decoded(batch).rows)
     np.testing.assert_array_equal(points[:, 3:], expected.astype(np.float32))
 
 

@@ -119,7 +119,7 @@ def test_thermal_stress_is_shown_and_written(fem, tmp_path, capsys):
     # Twice the expansion of the default has twice the stress.
     usual = compute_thermal_stress(bodies.Body(width=12e-3), LAYOUTS["planar"], 2).pads
     np.testing.assert_allclose(stress["pads"], 2 * usual, atol=1e-3)
-    components = Pipeline([find_shipped_calibration(LAYOUTS["planar"])]).matrix(0) @ (
+    components = Pipeline([find_shipped_calibration(LAYOUTS["planar"])]).find_matrix(0) @ (
         2 * usual[:, 0]
     )
     assert f"shipped calibration: xx {components[0]:+.1f} Pa/K" in shown
@@ -135,7 +135,7 @@ def test_weight_is_shown_and_added_to_a_calibration(fem, tmp_path, capsys):
     assert replace(heavy, weight=None).id == shipped.id != heavy.id
     expected = compute_weight(bodies.Body(width=12e-3, density=2140.0), LAYOUTS["planar"]).pads
     np.testing.assert_allclose(heavy.weight.response, expected)
-    components = Pipeline([shipped]).matrix(0) @ (9.80665 * expected)
+    components = Pipeline([shipped]).find_matrix(0) @ (9.80665 * expected)
     assert f"z up, measured with the shipped calibration: zz {components[2, 2]:+.1f} Pa" in shown
     assert f"x up, measured with the shipped calibration: zx {components[4, 0]:+.1f} Pa" in shown
     again = tmp_path / "again.yaml"

@@ -22,7 +22,7 @@ from cube_tensor_driver.core.defaults import REST_FREQUENCY
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.modes import COMPONENTS, PLANE
-from cube_tensor_driver.core.response import ILLUSTRATIVE, response
+from cube_tensor_driver.core.response import ILLUSTRATIVE, compute_response
 from cube_tensor_driver.core.symmetry import find_structure
 
 BODY, NARROW = Body(), Body(width=20e-3)
@@ -210,7 +210,7 @@ def test_the_prototypes_readings_are_sums_of_the_response():
     """Eqs. 8 to 10 with V for the frequency shift: P_grad is the true gradient only where xx_x is
     known."""
     structure = find_structure(LAYOUTS["quad"], "slab")
-    a = response(structure, ILLUSTRATIVE)
+    a = compute_response(structure, ILLUSTRATIVE)
     shown = {
         "zz": (0, -4 * 1.4),
         "xx": (0, 4 * 0.3),

@@ -249,7 +249,7 @@ def test_a_slow_consumer_loses_the_oldest_rows_and_is_told(
 def test_rows_that_wait_are_counted(tmp_path: Path) -> None:
     with open_links(make_skin(1), port_directory=tmp_path) as source:
         for n_rows in (3, 2, 4):
-            source._put(FrequencyRows.of(np.arange(n_rows), np.ones((n_rows, 8))))
+            source._put(FrequencyRows.from_values(np.arange(n_rows), np.ones((n_rows, 8))))
         next(iter(source))
         statistics = source.statistics()
     assert (statistics["rows given"], statistics["rows waiting"]) == (3, 6)

@@ -98,7 +98,7 @@ def test_rows_have_the_same_bits(pads: tuple[int, ...], monkeypatch: pytest.Monk
             assert builder.cubes.learn(link, Hello(link, 0, sample.n_pads, 1, uids)) == []
             builder.add(link, sample, 1_700_000_000_000_000_000 + link)
         built.append(builder.build())
-    for name, c in built[0].columns().items():
+    for name, c in built[0].collect_columns().items():
         python = getattr(built[1], name)
         assert c.dtype == python.dtype
         np.testing.assert_array_equal(c.view(np.uint8), python.view(np.uint8), name)

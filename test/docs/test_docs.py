@@ -248,13 +248,16 @@ def test_ros_commands_name_what_the_package_has():
 def test_programs_of_a_page_run(name):
     import numpy as np
 
-    from cube_tensor_driver.core.calibration import illustrative
+    from cube_tensor_driver.core.calibration import make_illustrative_calibration
     from cube_tensor_driver.core.poses import CubePoses
 
     poses = CubePoses(np.zeros((1, 3)), np.eye(3)[None], np.full(1, 0.002))
     there = {
         "skin": types.SimpleNamespace(
-            poses=poses, calibrations=[illustrative("planar")], elastomer=None, rate=None
+            poses=poses,
+            calibrations=[make_illustrative_calibration("planar")],
+            elastomer=None,
+            rate=None,
         ),
         "source": (),
         "reconstruct": types.SimpleNamespace(errors=None),

@@ -330,7 +330,7 @@ def test_windows_take_samples_in_any_order():
     np.add.at(counts, (frame, cube), 1)
     depth = int(counts.max())
     value = random.normal(size=(4000, 15))
-    rows = StressRows.of(cube, value[:, :6], value[:, 6:], sequence=np.arange(4000))
+    rows = StressRows.from_values(cube, value[:, :6], value[:, 6:], sequence=np.arange(4000))
     bounds = np.append(np.cumsum(random.integers(1, 60, 200)), 4000).clip(max=4000)
     given = [(frame[i:j], rows.select(slice(i, j))) for i, j in pairwise([0, *bounds])]
     blocks = [range(len(counts))[begin : begin + 7] for begin in range(0, len(counts), 7)]

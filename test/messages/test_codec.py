@@ -70,7 +70,7 @@ def counts_at(kind: str, n: int, pads: int = 8) -> dict[str, int]:
 
 
 def by_rosbags(kind: str, rows: FrequencyRows | StressRows, frame_id: str) -> bytes:
-    fields = {name: column.ravel() for name, column in rows.columns().items()}
+    fields = {name: column.ravel() for name, column in rows.collect_columns().items()}
     fields["time_offset"] = (fields.pop("stamp_ns") - STAMP_NS).astype(np.int32)
     if kind == FREQUENCIES:
         fields["n_pads"] = rows.frequency.shape[1]
@@ -79,7 +79,7 @@ def by_rosbags(kind: str, rows: FrequencyRows | StressRows, frame_id: str) -> by
 
 
 def assert_equal(one: FrequencyRows | StressRows, other: FrequencyRows | StressRows) -> None:
-    for name, a in one.columns().items():
+    for name, a in one.collect_columns().items():
         b = getattr(other, name)
         assert (a.dtype, a.shape) == (b.dtype, b.shape), name
         assert a.tobytes() == b.tobytes(), name

@@ -52,7 +52,7 @@ def noise_covariance(calibration: Calibration) -> np.ndarray:
     draws = np.random.default_rng(5).standard_normal((DRAWS, calibration.layout.n_pads))
     hertz = calibration.rest_frequency + draws * calibration.noise * per_pascal
     pipeline = Pipeline([calibration], np.float64)
-    rows = pipeline.process(FrequencyRows.of(np.zeros(DRAWS, int), hertz))
+    rows = pipeline.process(FrequencyRows.from_values(np.zeros(DRAWS, int), hertz))
     return np.cov(np.hstack([rows.stress, rows.gradient]), rowvar=False)
 
 
@@ -154,7 +154,7 @@ def test_each_number_of_a_tensor_and_a_wrench_is_in_its_field():
     from cube_tensor_driver.ros.messages import make_tensor_message, make_wrench_message
 
     stress, gradient = np.arange(12.0).reshape(2, 6), 100 + np.arange(18.0).reshape(2, 9)
-    rows = StressRows.of(
+    rows = StressRows.from_values(
         np.arange(2),
         stress,
         gradient,

@@ -37,7 +37,7 @@ from cube_tensor_driver.core.defaults import FREQUENCY_NOISE
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.modes import to_matrix
-from cube_tensor_driver.core.oscillator import pad_frequency
+from cube_tensor_driver.core.oscillator import compute_pad_frequency
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rate_limit import find_next_due_ns
 from cube_tensor_driver.core.rows import FrequencyRows
@@ -89,7 +89,7 @@ def frequencies(skin: Skin, force: np.ndarray, centre: np.ndarray) -> np.ndarray
     stress, slope = contact.field(below, *load, ELASTOMER.poisson)
     calibration = skin.calibrations[0]
     gradient = np.moveaxis(to_matrix(slope.swapaxes(1, 2)), 1, 3)  # (cubes, 3, 3, axis)
-    state = calibration.modes.state(to_matrix(stress), calibration.half_side * gradient)
+    state = calibration.modes.compute_state(to_matrix(stress), calibration.half_side * gradient)
     pads = state @ calibration.response.T
     rest, beta = calibration.rest_frequency, calibration.beta
     return pad_frequency(pads, rest, beta, calibration.modulus)

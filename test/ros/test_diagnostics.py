@@ -133,7 +133,9 @@ def test_each_count_of_the_reconstruction_is_in_its_pair():
             lost.note_arrival(number)
         blank = np.zeros((len(status), 9))
         diagnostics.count(
-            StressRows.of(np.arange(len(status)), blank[:, :6], blank, status=np.array(status))
+            StressRows.from_values(
+                np.arange(len(status)), blank[:, :6], blank, status=np.array(status)
+            )
         )
         (rows,) = diagnostics.make_statuses(False)[0]
         return (rows.level, rows.message.partition("; ")[2]), pairs(rows)
@@ -238,7 +240,9 @@ def test_an_inactive_node_says_so_and_blames_no_cube():
         if second is not None:
             cubes = np.arange(len(SKIN.cubes))
             stamps = np.full(len(cubes), second * 1_000_000_000)
-            reconstructor(FrequencyRows.of(cubes, rest.astype(np.float32), stamp_ns=stamps))
+            reconstructor(
+                FrequencyRows.from_values(cubes, rest.astype(np.float32), stamp_ns=stamps)
+            )
         statuses, changes = diagnostics.make_statuses(active)
         assert not changes
         return [status.message for status in statuses]

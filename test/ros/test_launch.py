@@ -491,7 +491,7 @@ def test_a_robot_includes_a_simulated_skin(ros, tmp_path):
     assert "robot_description:=skin_description" in publisher
     (folder,) = tmp_path.glob("robot1_hand_skin_*")
     with open_bag(folder) as source:
-        assert source.skin.frame(source.skin.cubes[0]) == "robot1_skin_c00"
+        assert source.skin.make_frame_id(source.skin.cubes[0]) == "robot1_skin_c00"
     with Bag(folder) as bag:
         recorded = {connection.topic for connection in bag.connections}
     names = ("frequencies", "felt", "compensation", "info", "driver/info", "diagnostics")

@@ -30,7 +30,7 @@ def places(n: int = 3, turn: np.ndarray | None = None) -> CubePoses:
 
 def rows(values: np.ndarray, status: object = 0, cube: object = None) -> StressRows:
     cubes = np.arange(len(values)) if cube is None else cube
-    return StressRows.of(cubes, values[:, :6], values[:, 6:], residual=1.0, status=status)
+    return StressRows.from_values(cubes, values[:, :6], values[:, 6:], residual=1.0, status=status)
 
 
 def test_traction_pushes_to_the_face_and_pulls_away_from_it():
@@ -95,21 +95,21 @@ def test_health_says_doubtful_no_tensor_and_stale():
     newest.update(rows(np.zeros((4, 15)), cube=np.array([0, 1, 2, 9])), 10.0)  # cube 9 is not ours
     newest.update(rows(values[:1], PAD_FAULT, cube=np.array([1])), 10.5)
     newest.update(rows(values[:1], INVALID | PAD_FAULT, cube=np.array([2])), 10.5)
-    assert newest.health(10.6, 1.0).tolist() == [
+    assert newest.compute_health(10.6, 1.0).tolist() == [
         FINE,
         DOUBTFUL,
         FAULTY,
         STALE,
     ]
-    assert newest.health(11.2, 1.0).tolist() == [
+    assert newest.compute_health(11.2, 1.0).tolist() == [
         STALE,
         DOUBTFUL,
         FAULTY,
         STALE,
     ]
-    believed = newest.usable_values(newest.health(10.6, 1.0))
+    believed = newest.select_usable_values(newest.compute_health(10.6, 1.0))
     assert np.isnan(believed).all(axis=1).tolist() == [False, False, True, True]
-    crosses = scene.make_fault_crosses(places(4), newest.health(10.6, 1.0))
+    crosses = scene.make_fault_crosses(places(4), newest.compute_health(10.6, 1.0))
     assert (np.ptp(crosses[0], axis=1) == 0).all() and (
         np.ptp(crosses[1:], axis=2).max(axis=(1, 2)) > 0.004
     ).all()
@@ -127,7 +127,7 @@ def test_a_residual_now_and_then_is_noise_and_one_that_stays_is_shown():
         newest.update(
             rows(np.zeros((n, 15)), random.binomial(1, chance) * RESIDUAL, cube=np.arange(n)), now
         )
-        health = newest.health(now, 1.0)
+        health = newest.compute_health(now, 1.0)
         assert (np.delete(health, 7) == FINE).all()
         if not (2 < now < 3 or 4 < now < 5):
             assert health[7] == (DOUBTFUL if 3 <= now <= 4 else FINE), now
@@ -135,7 +135,7 @@ def test_a_residual_now_and_then_is_noise_and_one_that_stays_is_shown():
         rows(np.zeros((n, 15)), np.full(n, PAD_FAULT), cube=np.arange(n)), -100.0
     )  # a bag plays again
     newest.update(rows(np.zeros((n, 15)), cube=np.arange(n)), -99.0)
-    assert (newest.health(-99.0, 1.0) == FINE).all()
+    assert (newest.compute_health(-99.0, 1.0) == FINE).all()
 
 
 def test_markers_node_draws_what_comes(ros, tmp_path):

@@ -29,9 +29,9 @@ from cube_tensor_driver.bags.source import open_bag
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.config.calibration import write_calibration
 from cube_tensor_driver.config.yaml import read_yaml, write_yaml
-from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.calibration import make_illustrative_calibration
 from cube_tensor_driver.core.compensation.models import CreepModel, ThermalModel, WeightModel
-from cube_tensor_driver.core.oscillator import pad_frequency
+from cube_tensor_driver.core.oscillator import compute_pad_frequency
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows, concatenate
 from cube_tensor_driver.core.status import COMPENSATION, CREEP, THERMAL, WEIGHT
@@ -93,7 +93,7 @@ ratio 0.475, and a bar of 7750 kg/m³ that lies 0.2 mm deeper. It is computed on
 
 @pytest.fixture
 def skin_file(tmp_path):
-    calibration = replace(illustrative("planar"), weight=WeightModel(RESPONSE))
+    calibration = replace(make_illustrative_calibration("planar"), weight=WeightModel(RESPONSE))
     write_calibration(tmp_path / "heavy.yaml", calibration)
     cubes = [
         {
@@ -181,10 +181,10 @@ def scan_at(t: float, moving: MovingSkin | None = None) -> FrequencyRows:
     pads = np.full((2, 8), -300.0)
     if moving is not None:
         pads = np.array([TRUE_RESPONSE @ true_force(moving, t + 1e-3 * c, c) for c in range(2)])
-    c = illustrative("planar")
-    f = pad_frequency(pads, c.rest_frequency, c.beta, c.modulus).astype(np.float32)
+    c = make_illustrative_calibration("planar")
+    f = compute_pad_frequency(pads, c.rest_frequency, c.beta, c.modulus).astype(np.float32)
     cube = np.arange(2, dtype=np.uint16)
-    return FrequencyRows.of(
+    return FrequencyRows.from_values(
         cube, f, stamp_ns=stamps, sequence=round(t / ROW_PERIOD_S), temperature=25 + 10 * t
     )
 
@@ -259,7 +259,7 @@ def test_a_shaken_arm_leaves_no_weight_and_no_contact(start, monkeypatch):
     # Measured: 2.9, 3.0 and 4.9 Pa, and 13 Pa at most.
     assert (np.sqrt((left**2).mean(axis=0)) < 5).all()
     assert np.abs(left).max() < 30
-    off = Reconstructor([illustrative("planar")] * 2).process(rows)
+    off = Reconstructor([make_illustrative_calibration("planar")] * 2).process(rows)
     assert np.abs(off.stress[:, [0, 2, 4]]).max() > 200
 
 
@@ -289,7 +289,7 @@ def write_lasting_effects(folder, ramp: float = 0.0) -> None:
     thermal = ThermalModel(
         np.array(25.0), np.array([20.0, 5.0]), 10 * pads, ramp=np.full((8, 1), ramp)
     )
-    cube = replace(illustrative("planar"), weight=WeightModel(RESPONSE))
+    cube = replace(make_illustrative_calibration("planar"), weight=WeightModel(RESPONSE))
     write_calibration(folder / "heavy.yaml", replace(cube, creep=creep, thermal=thermal))
 
 
@@ -337,7 +337,7 @@ def test_a_bag_gives_the_bits_of_the_node_from_every_state_on(start, monkeypatch
     write_bag(tmp_path / "whole", node, rows, range(0))
     with open_bag(tmp_path / "whole") as source:
         found = concatenate([stress for _, stress in reconstruct(source)])
-    for name, column in expected.columns().items():
+    for name, column in expected.collect_columns().items():
         assert column.tobytes() == getattr(found, name).tobytes(), name
 
     later = rows.select(slice(20, None))
@@ -480,8 +480,8 @@ def test_the_errors_of_the_stress_are_sent_twice_a_second_and_when_they_grow(sta
     (unknown,) = node.sent["errors"]
     Contacts._on_errors(contacts, unknown)
     found = Contacts._find_errors(contacts, 2)
-    matrix = node._reconstructor.pipeline.matrix(0)
-    expected = matrix @ (illustrative("planar").gain[:, None] * RESPONSE * G)
+    matrix = node._reconstructor.pipeline.find_matrix(0)
+    expected = matrix @ (make_illustrative_calibration("planar").gain[:, None] * RESPONSE * G)
     np.testing.assert_allclose(found[0, :, :3], expected, rtol=1e-5)
     assert Contacts._find_errors(contacts, 3) is None
     played(node, MovingSkin(), 1.1)
@@ -497,7 +497,7 @@ def test_the_errors_of_the_stress_are_sent_twice_a_second_and_when_they_grow(sta
 
 def test_the_weight_of_a_simulated_arm_that_moves_is_subtracted(ros, tmp_path, skin_file):
     """Simulator, its IMU, driver and reconstruction. The second cube has no block `weight`."""
-    heavy = replace(illustrative("planar"), weight=WeightModel(TRUE_RESPONSE))
+    heavy = replace(make_illustrative_calibration("planar"), weight=WeightModel(TRUE_RESPONSE))
     write_calibration(tmp_path / "truth.yaml", heavy)
     skin = read_yaml(skin_file)
     skin["cubes"][1]["calibration"] = "planar"
@@ -548,9 +548,9 @@ def test_the_tensor_of_a_cube_states_what_is_not_known_of_its_weight(start, monk
     fake_tf(monkeypatch, imu=IMU_FRAME)
     node = start(imu="/imu")
     node.on_rows(scan_at(0.1))
-    unknown = node._reconstructor.covariance(0)
+    unknown = node._reconstructor.compute_covariance(0)
     played(node, MovingSkin(), 0.1)
-    known = node._reconstructor.covariance(0)
-    np.testing.assert_array_equal(known, node._reconstructor.pipeline.covariance(0))
+    known = node._reconstructor.compute_covariance(0)
+    np.testing.assert_array_equal(known, node._reconstructor.pipeline.compute_covariance(0))
     # zz: 1 g along x and z, which RESPONSE turns into about 115 Pa
     assert 80**2 < unknown[2, 2] - known[2, 2] < 150**2

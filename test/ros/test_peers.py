@@ -98,14 +98,15 @@ def test_messages_of_any_content_are_refused_and_counted(skin):
     publisher = skin.node.create_publisher(SkinFrequencies, "frequencies", 100)
     diagnostics = skin.listen(DiagnosticArray, "/diagnostics")
     good = encoded(
-        FrequencyRows.of(np.zeros(1, np.uint16), np.full((1, 8), 1e5, np.float32)), b"skin\0"
+        FrequencyRows.from_values(np.zeros(1, np.uint16), np.full((1, 8), 1e5, np.float32)),
+        b"skin\0",
     )
     rows_at = len(good) - len(good[good.index(b"skin\0") + 8 :])
     for rows in (2**29, 2**31, 2**32 - 1):
         publisher.publish(good[:rows_at] + rows.to_bytes(4, "little") + good[rows_at + 4 :])
     publisher.publish(good[:20])
     many = np.zeros(30_000, np.uint16)
-    rows = FrequencyRows.of(many, np.zeros((len(many), 8), np.float32))
+    rows = FrequencyRows.from_values(many, np.zeros((len(many), 8), np.float32))
     publisher.publish(encoded(rows, b"skin\0"))
 
     def refused() -> bool:

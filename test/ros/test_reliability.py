@@ -37,7 +37,7 @@ from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.tare import write_tare
 from cube_tensor_driver.config.yaml import read_yaml, write_yaml
-from cube_tensor_driver.core.oscillator import pad_frequency
+from cube_tensor_driver.core.oscillator import compute_pad_frequency
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 from cube_tensor_driver.processes.children import Children, format_ros_arguments
 from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, list_skin_processes
@@ -130,7 +130,9 @@ def loaded(pascal):
     from cube_tensor_driver.simulation.cubes import compute_true_state
 
     v = compute_true_state(CALIBRATION, stress, gradient) @ CALIBRATION.response.T
-    return pad_frequency(v[0], CALIBRATION.rest_frequency, CALIBRATION.beta, CALIBRATION.modulus)
+    return compute_pad_frequency(
+        v[0], CALIBRATION.rest_frequency, CALIBRATION.beta, CALIBRATION.modulus
+    )
 
 
 def test_tare_is_refused_taken_told_kept_and_undone(stage):

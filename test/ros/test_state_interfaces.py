@@ -152,7 +152,7 @@ def test_the_example_names_what_is_published():
     assert controllers.keys() == manager.keys() - {"update_rate"}
     links = {link.get("name") for link in robot.findall("link")}
     joints = {joint.get("name") for joint in robot.findall("joint[@type='revolute']")}
-    own = {skin.frame(cube) for cube in skin.cubes}
+    own = {skin.make_frame_id(cube) for cube in skin.cubes}
     assert skin.parent_frame in links
     admittance = controllers.pop("admittance_controller")["ros__parameters"]
     assert set(admittance["joints"]) == joints and admittance["ft_sensor"]["name"] in sensors

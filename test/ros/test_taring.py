@@ -65,7 +65,7 @@ def skin(tmp_path):
     for row in range(3 * RATE):
         node.now_ns = row * 1_000_000_000 // RATE
         frequency = 1.002 * CALIBRATION.rest_frequency[None].astype(np.float32)
-        reconstructor.process(FrequencyRows.of([0], frequency, stamp_ns=node.now_ns))
+        reconstructor.process(FrequencyRows.from_values([0], frequency, stamp_ns=node.now_ns))
     return SimpleNamespace(
         services=node.services,
         errors=node.errors,

@@ -50,7 +50,7 @@ def scan(number: int, values: np.ndarray) -> StressRows:
     stress[:, [1, 3, 5]] = np.nan
     gradient[:, [1, 3, 4, 5, 7]] = np.nan
     stamp_ns = START_NS + number * 1_000_000
-    return StressRows.of(np.arange(16), stress, gradient, stamp_ns=stamp_ns)
+    return StressRows.from_values(np.arange(16), stress, gradient, stamp_ns=stamp_ns)
 
 
 def make_publisher(skin: Skin) -> tuple[TouchPublisher, Topic]:

@@ -24,7 +24,7 @@ from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.modes import COMPONENTS
-from cube_tensor_driver.core.oscillator import pad_frequency
+from cube_tensor_driver.core.oscillator import compute_pad_frequency
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows, concatenate
 from cube_tensor_driver.demo.load_verification import compute_component_noise
@@ -64,7 +64,7 @@ def test_the_load_comes_out_again():
     for rows in simulate(SKIN, load, rate=50.0, duration=1.0):
         found = reconstruct(rows)
         stress, gradient = load.at(1e-9 * rows.stamp_ns[0])
-        frequency = pad_frequency(
+        frequency = compute_pad_frequency(
             compute_true_state(calibration, stress, gradient) @ calibration.response.T, *law
         )
         rounding = 0.5e-3 + 2.0**-24 * frequency
@@ -207,7 +207,7 @@ def test_noise_of_the_calibration_gives_a_residual_of_one_and_the_stated_deviati
     cubes = SimulatedCubes([calibration] * n, PadErrors(noise=None))
     millihertz = cubes.frequency(np.zeros((n, 6)), np.zeros((n, 6, 3)), 0.0)
     rows = Reconstructor([calibration] * n).process(
-        FrequencyRows.of(np.arange(n), (millihertz * 1e-3).astype(np.float32))
+        FrequencyRows.from_values(np.arange(n), (millihertz * 1e-3).astype(np.float32))
     )
     assert np.sqrt(np.mean(rows.residual**2)) == pytest.approx(1.0, abs=0.05)
     skin = replace(SKIN, cubes=(replace(SKIN.cubes[0], calibration=calibration),))

@@ -14,7 +14,7 @@ from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.yaml import read_yaml
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.layout import LAYOUTS
-from cube_tensor_driver.core.oscillator import pad_stress
+from cube_tensor_driver.core.oscillator import compute_pad_stress
 from cube_tensor_driver.simulation.cubes import PadErrors, SimulatedCubes
 from cube_tensor_driver.simulation.imperfections import Imperfections, read_imperfections
 from cube_tensor_driver.simulation.temperature import CELLS, WarmLayer, read_thermal_stress
@@ -38,7 +38,7 @@ def read_stress(hertz: np.ndarray) -> np.ndarray:
     calibration = find_shipped_calibration(LAYOUTS["cube"])
     assert calibration is not None
     rest, beta, modulus = calibration.rest_frequency, calibration.beta, calibration.modulus
-    return pad_stress(hertz * 1e-3, rest, beta, modulus)
+    return compute_pad_stress(hertz * 1e-3, rest, beta, modulus)
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,9 @@ import numpy as np
 from point_loads import below_ball
 
 from cube_tensor_driver.config.skin import Elastomer
-from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.calibration import make_illustrative_calibration
 from cube_tensor_driver.core.compensation.models import WeightModel
-from cube_tensor_driver.core.oscillator import pad_frequency
+from cube_tensor_driver.core.oscillator import compute_pad_frequency
 from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows
@@ -37,7 +37,7 @@ def test_turning_over_is_no_contact_and_hides_none_that_is_stronger():
         np.stack([x, y, 0 * x], axis=1), np.tile(np.eye(3), (n, 1, 1)), np.full(n, 2e-3)
     )
     response = read_weight("cube_11mm", 24)
-    cube = replace(illustrative("cube"), weight=WeightModel(response))
+    cube = replace(make_illustrative_calibration("cube"), weight=WeightModel(response))
     reconstruct = Reconstructor([cube] * n)
     finders = (
         make_contact_finder(ContactSettings(), poses, [cube] * n, ELASTOMER) for _ in range(3)
@@ -47,8 +47,8 @@ def test_turning_over_is_no_contact_and_hides_none_that_is_stronger():
     n_false = n_found = n_coarse = 0
     for change in ([0, 0, 2 * G], [0, 0, -2 * G], [G, 0, -G], [0, -G, -G]):
         pads = np.tile(1.03 * cube.gain * (response @ change), (n, 1))
-        frequency = pad_frequency(pads, cube.rest_frequency, cube.beta, cube.modulus)
-        rows = FrequencyRows.of(
+        frequency = compute_pad_frequency(pads, cube.rest_frequency, cube.beta, cube.modulus)
+        rows = FrequencyRows.from_values(
             np.arange(n, dtype=np.uint16),
             frequency,
             stamp_ns=10**9,

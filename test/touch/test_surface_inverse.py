@@ -10,7 +10,7 @@ from curved_skin import cylinder_stress, flat_error
 from point_loads import below_ball
 
 from cube_tensor_design.studies.field_study import compute_field_below, make_flat_skin
-from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.calibration import make_illustrative_calibration
 from cube_tensor_driver.core.defaults import POISSONS_RATIO
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.modes import COMPONENTS, STRESS
@@ -161,7 +161,7 @@ def test_it_is_made_of_a_skin_as_read_from_its_file():
     from types import SimpleNamespace as Skin
 
     poses = CubePoses(*(column[:6] for column in FLAT))
-    calibrations = [illustrative("planar")] * 6
+    calibrations = [make_illustrative_calibration("planar")] * 6
     inverse = SurfaceInverse(
         Skin(poses=poses, calibrations=calibrations, elastomer=None), depth=DEPTH
     )

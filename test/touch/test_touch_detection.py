@@ -77,7 +77,7 @@ class Run:
         stamp_ns = START_NS + self.scans * 10**9 // RATE
         cubes = np.arange(len(values), dtype=np.uint16)
         stress, gradient = np.split(values.astype(np.float32), [6], axis=1)
-        return StressRows.of(cubes, stress, gradient, stamp_ns=stamp_ns, **columns)
+        return StressRows.from_values(cubes, stress, gradient, stamp_ns=stamp_ns, **columns)
 
     def feed(self, count: int, load: np.ndarray | float = 0.0) -> list:
         return [self.touch(self.rows(load))[0] for _ in range(count)]

@@ -52,7 +52,7 @@ def test_no_line_bridges_a_gap():
         seconds=seconds,
         frequency=np.full((n, 2), 1e5),
         rest=np.full(2, 1e5),
-        rows=StressRows.of(
+        rows=StressRows.from_values(
             np.zeros(n, np.uint16), np.zeros((n, 6)), np.zeros((n, 9)), residual=1.0
         ),
     )

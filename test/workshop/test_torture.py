@@ -105,13 +105,13 @@ def test_a_mutated_module_is_the_one_that_others_import():
 def test_a_torture_has_a_domain_of_its_own(monkeypatch):
     """Where another skin ran in its domain, it ended with an IndexError."""
     monkeypatch.setenv("ROS_DOMAIN_ID", "42")
-    with domain.own_domain() as one, domain.own_domain() as other:
+    with domain.use_own_domain() as one, domain.use_own_domain() as other:
         assert os.environ["ROS_DOMAIN_ID"] == str(other)
         assert len({42, one, other}) == 3
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as participant:
             # The first participant of the domain that would come next (DDSI-RTPS 9.6.2).
             participant.bind(("", 7400 + 250 * (other - 1) + 10))
-            with domain.own_domain() as third:
+            with domain.use_own_domain() as third:
                 assert third < other - 1
     assert os.environ["ROS_DOMAIN_ID"] == "42"
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from cube_tensor_driver.core.calibration import illustrative
-from cube_tensor_driver.core.oscillator import pad_frequency
+from cube_tensor_driver.core.calibration import make_illustrative_calibration
+from cube_tensor_driver.core.oscillator import compute_pad_frequency
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows
 
@@ -48,14 +48,14 @@ def bench_pipeline(cubes: int) -> dict[str, Any]:
 
 def _make_functions(cubes: int) -> dict[str, Function]:
     """Return functions that reconstruct a scan with health, without, and by bare equations."""
-    calibration = illustrative(LAYOUT)
+    calibration = make_illustrative_calibration(LAYOUT)
     rng = np.random.default_rng(0)
     modes = rng.normal(0, LOAD_PA, (cubes, 7))
     law = calibration.rest_frequency, calibration.beta, calibration.modulus
-    frequency = pad_frequency(modes @ calibration.response.T, *law).astype(np.float32)
+    frequency = compute_pad_frequency(modes @ calibration.response.T, *law).astype(np.float32)
 
     reconstructor = Reconstructor([calibration] * cubes)
-    rows = FrequencyRows.of(np.arange(cubes, dtype=np.uint16), frequency)
+    rows = FrequencyRows.from_values(np.arange(cubes, dtype=np.uint16), frequency)
     rest = np.tile(calibration.rest_frequency, (cubes, 1)).astype(np.float32)
     # Any matrix of the size of an estimator takes the same time.
     matrix = rng.normal(size=(8, 16)).astype(np.float32)

@@ -32,7 +32,7 @@ from cube_tensor_driver.demo.verification import compare, percentile
 from cube_tensor_driver.messages.codec import stress_codec
 from cube_tensor_driver.msg import SkinContacts, SkinStress, SkinTouch
 from cube_tensor_driver.processes.children import Children
-from cube_tensor_driver.processes.domain import own_domain
+from cube_tensor_driver.processes.domain import use_own_domain
 from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, list_skin_processes
 from cube_tensor_driver.ros.qos import make_batch_profile
 from cube_tensor_driver.simulation.sample_log import SampleLog, SampleTable
@@ -175,7 +175,7 @@ def _prepare_domain() -> Iterator[Progress]:
     The bar is drawn only once a second, because this process receives no messages meanwhile.
     """
     progress = Progress(console=Console(stderr=True), refresh_per_second=1)
-    with own_domain(), progress:
+    with use_own_domain(), progress:
         yield progress
 
 

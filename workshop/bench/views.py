@@ -24,7 +24,7 @@ from cube_tensor_driver.demo.demo import write_grid
 from cube_tensor_driver.demo.running import observe_skin
 from cube_tensor_driver.demo.usage import Usage
 from cube_tensor_driver.processes.children import Children
-from cube_tensor_driver.processes.domain import own_domain
+from cube_tensor_driver.processes.domain import use_own_domain
 from cube_tensor_driver.processes.skin_processes import VIEW, SimulatedHubs, list_skin_processes
 
 RATE = 100.0
@@ -85,7 +85,7 @@ def measure(cubes: int) -> dict[str, float]:
         cubes: Number of cubes of the skin.
     """
     with contextlib.ExitStack() as stack:
-        stack.enter_context(own_domain())
+        stack.enter_context(use_own_domain())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cube_views_")))
         children = stack.enter_context(Children(folder))
         observer = stack.enter_context(observe_skin("measure", children))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cube_tensor_driver.core.arrays import Array, Index, Mask
-from cube_tensor_driver.core.estimator import chi2_limit
+from cube_tensor_driver.core.estimator import compute_chi2_limit
 from cube_tensor_driver.core.matching import NO_MATCH, match_rows
 from cube_tensor_driver.core.modes import COMPONENTS
 from cube_tensor_driver.core.pipeline import Pipeline
@@ -158,7 +158,7 @@ class _Reference:
         # The limit of the residual depends on its degrees of freedom, which are at most the number
         # of pads.
         degrees = range(1, self._pipeline.n_pads + 1)
-        chi2_limits = [chi2_limit(degree) for degree in degrees]
+        chi2_limits = [compute_chi2_limit(degree) for degree in degrees]
         self._limits = np.sqrt(np.array(chi2_limits) / degrees)
         self._deviations: dict[tuple[int, int], Array] = {}
 
@@ -206,6 +206,6 @@ class _Reference:
 
     def _compute_deviation_of(self, cube: int, left_out: int) -> Array:
         if (cube, left_out) not in self._deviations:
-            variance = np.diag(self._pipeline.covariance(cube, left_out))
+            variance = np.diag(self._pipeline.compute_covariance(cube, left_out))
             self._deviations[cube, left_out] = np.sqrt(np.nan_to_num(variance))
         return self._deviations[cube, left_out]

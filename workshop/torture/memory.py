@@ -40,7 +40,7 @@ class MemoryMonitor:
         if now_s < self._next_s:
             return
         self._next_s = now_s + PERIOD_S
-        running = set(self._names).intersection(self._children.names())
+        running = set(self._names).intersection(self._children.list_names())
         # A process that is being started again does not run for a moment.
         usage = Usage(self._children, running)
         for name, size_mb in usage.measure_memory_mb().items():

@@ -17,7 +17,7 @@ from typing import Any
 
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.demo.running import Interrupted
-from cube_tensor_driver.processes.domain import own_domain
+from cube_tensor_driver.processes.domain import use_own_domain
 from cube_tensor_driver.processes.stop_signals import stop_event
 from cube_tensor_driver.views.terminal.output import show_progress_bar
 
@@ -164,7 +164,7 @@ def torture(
     """Play one torture and return all figures, see `play` for the arguments."""
     began_s = time.monotonic()
     # A skin that runs elsewhere on this machine must not be heard.
-    with own_domain(), tempfile.TemporaryDirectory(prefix="cube_torture_") as folder:
+    with use_own_domain(), tempfile.TemporaryDirectory(prefix="cube_torture_") as folder:
         played = play(duration, seed, Path(folder), interrupted, mutation)
         checked = check_all(played.record, played.log, played.readings)
     return {

@@ -477,7 +477,7 @@ def _replace_settings(
         if not first_cube.keys() <= covariances.keys():
             pipeline = Pipeline(current.calibrations)
             covariances |= {
-                name: pipeline.covariance(number) for name, number in first_cube.items()
+                name: pipeline.compute_covariance(number) for name, number in first_cube.items()
             }
         cubes = [
             replace(

@@ -91,7 +91,7 @@ def frequency_table(source: BagSource) -> pyarrow.Table:
             "recorded_left_out": pyarrow.array(health.left_out, mask=unknown),
             "recorded_status": pyarrow.array(health.status, mask=unknown),
         }
-        values = rows.columns()
+        values = rows.collect_columns()
         for name, attribute in COLUMNS.items():
             if attribute in values:
                 columns[name] = as_column(values[attribute])
@@ -172,7 +172,7 @@ def reprocess_table(
             for name, attribute in COLUMNS.items()
             if name in columns
         }
-        rows = FrequencyRows.of(**attributes)
+        rows = FrequencyRows.from_values(**attributes)
         health = _read_recorded_health(columns)
         stress = reconstruct_rows(reconstructor, rows, health)
         batches.append(make_stress_batch(stress, cubes))

@@ -150,7 +150,7 @@ class Compensation:
             bits = np.where(effect.is_known, effect.bit, COMPENSATION)
             self.offsets.lasting[:] |= bits.astype(np.uint16)
 
-    def pad_errors(self, cubes: Index) -> Array:
+    def compute_pad_errors(self, cubes: Index) -> Array:
         """Return the errors (n, P, k) of what is subtracted from the pads, in Pa.
 
         They are those of the newest rows of n cubes by k independent causes. Each column has the
@@ -160,10 +160,10 @@ class Compensation:
             cubes: Numbers of the cubes.
         """
         errors = [np.zeros((len(cubes), self._pipeline.n_pads, 0))]
-        errors += [effect.errors(cubes) for effect in self._lasting]
+        errors += [effect.compute_errors(cubes) for effect in self._lasting]
         if self._has_forces:
             force = self.offsets.newest_force[cubes].astype(float)
-            errors.append(self._weight.errors(cubes, force))
+            errors.append(self._weight.compute_errors(cubes, force))
         # The stiffness of a pad that a cube does not have is NaN.
         found: Array = np.nan_to_num(np.concatenate(errors, axis=2))
         return found

@@ -21,7 +21,7 @@ gain.
 Loads before the first row and within a long gap are unknown. The memories are computed as if there
 had been no load before the first row, and as if the reading had changed along a straight line
 within the gap. The share of a memory that comes from unknown loads decays with its relaxation time.
-It causes an error, which `Creep.errors` states.
+It causes an error, which `Creep.compute_errors` states.
 
 A row is one sample of one cube, C the number of cubes of the skin, P the largest number of pads of
 a cube. Stresses are divided by the stiffness of the pads.
@@ -161,7 +161,7 @@ class Creep:
         elapsed_ns[is_lost] = 0
         return elapsed_ns, is_lost, is_gap
 
-    def errors(self, cubes: Index) -> Array:
+    def compute_errors(self, cubes: Index) -> Array:
         """Return the errors (n, P, k) of the computed creep of n cubes, in Pa.
 
         The k independent causes are unknown earlier loads and errors of the law of creep. Each
@@ -236,7 +236,7 @@ class Creep:
         pipeline = self._pipeline
         if self._rest_version == pipeline.rest_changes:
             return False
-        shift = np.nan_to_num(pipeline.shift_of_zero(self._rest))
+        shift = np.nan_to_num(pipeline.compute_zero_shift(self._rest))
         self._rest[:] = pipeline.rest_frequency
         self._rest_version = pipeline.rest_changes
         self._reading -= shift

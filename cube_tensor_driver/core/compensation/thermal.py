@@ -183,7 +183,7 @@ class Thermal:
         is_certain = self._is_measured & (deviation <= MAX_DEVIATION)
         self.is_known = self.has_model & is_certain
 
-    def errors(self, cubes: Index) -> Array:
+    def compute_errors(self, cubes: Index) -> Array:
         """Return the errors (n, P, k) of the thermal stress on the pads of n cubes, in Pa.
 
         Each of the k columns is the error, of one standard deviation, by one of k independent
@@ -213,7 +213,7 @@ class Thermal:
         ]
 
 
-def filter_weights(lag: Array) -> Array:
+def compute_filter_weights(lag: Array) -> Array:
     """Return the weights (L,) that make parallel low-pass filters equal to the filters in series.
 
     The sum of weight × output over the L parallel filters is the output of the series.

@@ -35,7 +35,7 @@ class Weight:
         self.response = gain * tabulate(models, "response", (n_pads, 3))
         self._deviation = gain * tabulate(models, "deviation", (n_pads, 3))
 
-    def errors(self, cubes: Index, force: Array) -> Array:
+    def compute_errors(self, cubes: Index, force: Array) -> Array:
         """Return the errors (n, P, 3) of the compensation of weight by independent causes, in Pa.
 
         Each axis of the cube is one cause, and each column has the size of one standard deviation.

@@ -242,7 +242,7 @@ class PadDiagnosis:
         """
         # Vibration raises the noise of all pads of a cube. They must not be reported as noisy then,
         # so the median noise of the pads is the usual noise if it is above that of the calibration.
-        usual = np.fmax(self.noise, _lower_median(window.noise))
+        usual = np.fmax(self.noise, _compute_lower_median(window.noise))
         self.bound = _compute_square_bound(usual)
         was_noisy = state & NOISY > 0
         ratio = np.where(was_noisy, NOISY_LEAVE, NOISY_ENTER)
@@ -259,7 +259,7 @@ class PadDiagnosis:
             span: Highest minus lowest frequency in the window (cubes, P), in Hz.
             state: Conditions known before the window ended (cubes, P).
         """
-        usual_span = _lower_median(span / self.noise)
+        usual_span = _compute_lower_median(span / self.noise)
         others_moved = usual_span > STUCK_MIN_SPAN
         # A pad with a loose wire may show a single frequency for a window. It is not stuck, and has
         # the condition open, short or range already.
@@ -315,7 +315,7 @@ class PadDiagnosis:
         still_span = STILL_MAX_SPAN * self.noise / self._rest
         limit = np.maximum(DRIFT_LIMIT, still_span)
         # A shift that all pads share is caused by temperature or a slow load, not by a fault.
-        own_shift = shift - _lower_median(shift)
+        own_shift = shift - _compute_lower_median(shift)
         drifting: Mask = np.abs(own_shift) > limit
         return drifting
 
@@ -356,7 +356,7 @@ def _compute_square_bound(noise: Array) -> Array:
     return (limit**2).astype(np.float32)
 
 
-def _lower_median(values: Real) -> Real:
+def _compute_lower_median(values: Real) -> Real:
     """Return the median over the pads of each cube (cubes, 1), without NaN.
 
     Of an even number of values, it is the lower one of the two in the middle.

@@ -18,7 +18,7 @@ from ..arrays import Index, Mask, Single, StatusBits, pad_table
 from ..calibration import tabulate_pads
 from ..kernel.contract import Columns, Tables
 from ..kernel.rows import find_impossible
-from ..oscillator import pad_frequency
+from ..oscillator import compute_pad_frequency
 from ..pipeline import Pipeline
 from ..status import OPEN, RANGE, REPORTED, SHORT
 from .diagnosis import Conditions, PadDiagnosis, has_high_residual
@@ -114,7 +114,7 @@ class Health:
         """Newest time stamp of the last scan, in ns; 0 before the first one."""
         return int(self.sums.window_ns[2])
 
-    def window(self) -> Window:
+    def read_window(self) -> Window:
         """Return the statistics of the present window, which has not ended."""
         return make_window(self.sums)
 
@@ -131,11 +131,11 @@ class Health:
         noise = tabulate_pads(calibrations, "noise", n_pads, fill=1.0)
         rest = self.pipeline.rest_frequency
         low, high, disconnected = (
-            pad_frequency(strain * modulus, rest, beta, modulus)
+            compute_pad_frequency(strain * modulus, rest, beta, modulus)
             for strain in (MIN_STRAIN, MAX_STRAIN, OPEN_STRAIN)
         )
-        self.sums.pads("low")[:] = low
-        self.sums.pads("high")[:] = high
+        self.sums.view_pads("low")[:] = low
+        self.sums.view_pads("high")[:] = high
         self._open = disconnected.astype(np.float32)
         # The slope of the pad law without load, dv/df = E (1 + beta) / f0, converts noise to Hz.
         slope = modulus * (1 + beta) / rest
@@ -194,7 +194,7 @@ class Health:
 
     def _close_window(self) -> None:
         """Evaluate the statistics of the present window."""
-        window = self.window()
+        window = self.read_window()
         self.history.append(window)
         self.closed += 1
         found = self.diagnosis.examine(window, self.state)
@@ -210,4 +210,4 @@ class Health:
 
     def _set_bound(self) -> None:
         """Set the limit to which squared second differences of a frequency are cut from now on."""
-        self.sums.pads("bound")[:] = np.nan_to_num(self.diagnosis.bound)
+        self.sums.view_pads("bound")[:] = np.nan_to_num(self.diagnosis.bound)

@@ -108,7 +108,7 @@ def make_state(rest_frequency: Array) -> HealthState:
         window_ns=np.array([1, 0, 0]),  # holds no time, so that the first row opens a window
     )
     state.cubes["temperature"] = np.nan
-    state.pads("base")[:] = rest_frequency
+    state.view_pads("base")[:] = rest_frequency
     clear_sums(state)
     return state
 
@@ -116,9 +116,9 @@ def make_state(rest_frequency: Array) -> HealthState:
 def clear_sums(state: HealthState) -> None:
     """Start a new window: set all sums, counts and gaps of the state to zero, in place."""
     for name in ("first_squares", "second_squares", "bounded_squares", "sum"):
-        state.pads(name)[:] = 0
-    state.pads("lowest")[:] = np.inf
-    state.pads("highest")[:] = -np.inf
+        state.view_pads(name)[:] = 0
+    state.view_pads("lowest")[:] = np.inf
+    state.view_pads("highest")[:] = -np.inf
     for name in ("gap_before", "gap_within", "rows", "over_limit"):
         state.cubes[name] = 0
 
@@ -127,16 +127,16 @@ def make_window(state: HealthState) -> Window:
     """Compute the statistics of the rows that the present window has so far."""
     rows = state.cubes["rows"]
     count = np.maximum(rows, 1)[:, None]
-    base = state.pads("base")
-    lowest = state.pads("lowest")
-    highest = state.pads("highest")
+    base = state.view_pads("base")
+    lowest = state.view_pads("lowest")
+    highest = state.view_pads("highest")
     is_measured = (rows[:, None] > 0) & ~np.isnan(base)
-    mean = base + state.pads("sum") / count
-    noise = np.sqrt(state.pads("bounded_squares") / count / 6)
+    mean = base + state.view_pads("sum") / count
+    noise = np.sqrt(state.view_pads("bounded_squares") / count / 6)
     # The minimum is above the maximum where no frequency was measured in the window.
     has_span = is_measured & (lowest <= highest)
-    first_squares = state.pads("first_squares")
-    second_squares = state.pads("second_squares")
+    first_squares = state.view_pads("first_squares")
+    second_squares = state.view_pads("second_squares")
     with np.errstate(invalid="ignore"):  # NaN where a frequency was not measured
         rough = second_squares > MAX_SMOOTH_ROUGHNESS * first_squares
     return Window(

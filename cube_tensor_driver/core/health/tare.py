@@ -172,7 +172,7 @@ def _select_windows(
     windows = list(health.history)[-count:]
     # The present window, which has not ended, is included, so that a tare is also refused if a
     # frequency moves in it.
-    present = health.window()
+    present = health.read_window()
     if present.rows.any():
         windows.append(present)
 

@@ -194,7 +194,7 @@ class HealthState(NamedTuple):
         """State of each cube (C,), of type `CUBE_STATE`, as a view."""
         return self.words.view(CUBE_STATE)[:, 0]
 
-    def pads(self, name: str) -> Single:
+    def view_pads(self, name: str) -> Single:
         """Return one quantity of all pads (C, P), as a view; `PAD_QUANTITIES` has the names."""
         view: Single = self.quantities[PAD_QUANTITIES.index(name)]
         return view

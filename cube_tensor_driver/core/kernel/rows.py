@@ -15,7 +15,7 @@ import numpy as np
 from ..arrays import Array, Index, Mask, PadMasks, Real, Single, StatusBits, Times, multiply
 from ..health.statistics import GAP_NS, MAX_JITTER_RATIO
 from ..modes import COMPONENTS, STRESS
-from ..oscillator import rest_ratio
+from ..oscillator import compute_rest_ratio
 from ..status import COMPENSATION, INVALID, PAD_FAULT, RESIDUAL, STAMP, TEMPERATURE
 from .contract import (
     DONE,
@@ -128,7 +128,7 @@ def compute_temperature_factor(
     """
     change = temperature.astype(float) - tables.reference[calibration]
     known_change = np.where(np.isfinite(change), change, 0)
-    return rest_ratio(tables.coefficients[calibration], known_change)
+    return compute_rest_ratio(tables.coefficients[calibration], known_change)
 
 
 def find_existing(tables: Tables, calibration: Numbers) -> Mask:
@@ -145,7 +145,7 @@ def find_existing(tables: Tables, calibration: Numbers) -> Mask:
     return pads < tables.pads[calibration][:, None]
 
 
-def mask_bits(tables: Tables, calibration: Numbers, mask: PadMasks) -> Mask:
+def unpack_mask_bits(tables: Tables, calibration: Numbers, mask: PadMasks) -> Mask:
     """Return a mask (N, P) of the pads that the cubes have and whose bits are set in bit masks.
 
     Args:
@@ -224,7 +224,7 @@ def _process(scan: slice, task: Task) -> tuple[int, int]:
 
     v, is_good = apply_law(tables, cube, rows.frequency, rows.temperature)
     is_lacking = find_existing(tables, calibration) & ~is_good
-    is_left_out = mask_bits(tables, calibration, out.left_out)
+    is_left_out = unpack_mask_bits(tables, calibration, out.left_out)
     is_bad = is_lacking | is_left_out
     bad = pack_bits(is_bad)
     if offsets is not None:
@@ -357,13 +357,13 @@ def find_impossible(
         Whether the frequency of a pad is impossible, and whether the device reports it (N, P).
     """
     f = rows.frequency.astype(np.float32)
-    low = health.pads("low")[cube]
-    high = health.pads("high")[cube]
+    low = health.view_pads("low")[cube]
+    high = health.view_pads("high")[cube]
     calibration = tables.calibration[cube]
     is_possible = (f > low) & (f < high)
     is_impossible = ~is_possible & find_existing(tables, calibration)
     # The device may set the bit of a pad that the cube does not have.
-    return is_impossible, mask_bits(tables, calibration, rows.pad_fault)
+    return is_impossible, unpack_mask_bits(tables, calibration, rows.pad_fault)
 
 
 def _add_to_window(
@@ -383,7 +383,7 @@ def _add_to_window(
     ratio, weight = _measure_pace(health, rows, cube)
     n = len(cube)
     f = rows.frequency[:n].astype(np.float32)
-    pads = {name: health.pads(name) for name in PAD_QUANTITIES}
+    pads = {name: health.view_pads(name) for name in PAD_QUANTITIES}
     difference = f - pads["last"][cube]
     second = difference - ratio * pads["difference"][cube]
     squares = second * second * weight

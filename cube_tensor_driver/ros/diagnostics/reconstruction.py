@@ -268,13 +268,13 @@ class CubeHealth:
         if not len(cubes):
             return {}
         health = self._health
-        newest = FrequencyRows.of(
+        newest = FrequencyRows.from_values(
             cubes,
-            health.sums.pads("last")[cubes],
+            health.sums.view_pads("last")[cubes],
             temperature=health.temperature[cubes],
         )
         left_out = health.sums.cubes["mask"][cubes]
-        is_suspect = self._pipeline.suspects(newest, left_out)
+        is_suspect = self._pipeline.find_suspects(newest, left_out)
         names = {}
         for cube, suspects in zip(cubes.tolist(), is_suspect, strict=True):
             pads = self._skin.cubes[cube].calibration.layout.pads

@@ -12,7 +12,7 @@ from geometry_msgs.msg import Point, Vector3
 from visualization_msgs.msg import Marker
 
 from ...core.arrays import Array, Index
-from ...core.poses import CubePoses, quaternions
+from ...core.poses import CubePoses, compute_quaternions
 from ...msg import SkinContacts
 from ...views import scene
 from .legend import (
@@ -122,7 +122,7 @@ class Canvas:
                 (cubes, 15).
             ranges: Values at the upper end of the colour scale and of the longest arrows.
             health: Health of each cube, (cubes,): fine, doubtful, faulty or stale, as
-                `LatestStress.health` returns it.
+                `LatestStress.compute_health` returns it.
             contacts: The newest message of contacts; None: no contact is drawn.
         """
         colours = scene.choose_colours(quantity, shown, ranges.colours)
@@ -264,7 +264,7 @@ def _make_plates(poses: CubePoses) -> list[tuple[Index, Shape]]:
     oriented = zip(
         groups,
         rotations,
-        quaternions(rotations),
+        compute_quaternions(rotations),
         strict=True,
     )
     for number, (members, rotation, (w, x, y, z)) in enumerate(oriented):

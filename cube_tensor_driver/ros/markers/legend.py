@@ -195,7 +195,7 @@ def draw_legend(
         quantity: The quantity that colours show.
         ranges: Values at the upper end of the colour scale and of the longest arrows.
         health: Health of each cube, (cubes,): fine, doubtful, faulty or stale, as
-            `LatestStress.health` returns it.
+            `LatestStress.compute_health` returns it.
     """
     height = TEXT_HEIGHT * place.width
     top = ranges.colours

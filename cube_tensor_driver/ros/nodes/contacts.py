@@ -105,7 +105,7 @@ class Contacts(SkinSubscriberNode):
         if finder is None:
             return None
         newest = skin.newest
-        values = newest.usable_values(health)
+        values = newest.select_usable_values(health)
         frame_id = skin.info.header.frame_id
         finder.update(
             1e-9 * skin.stamp_ns,
@@ -152,7 +152,7 @@ class Contacts(SkinSubscriberNode):
         finder = self._finder
         if finder is None:
             return None
-        values = skin.newest.usable_values(health)
+        values = skin.newest.select_usable_values(health)
         begins = finder.follow(1e-9 * skin.stamp_ns, values)
         return self._encode(skin, finder) if begins else None
 

@@ -55,7 +55,7 @@ class Markers(SkinSubscriberNode):
         self._ranges = scene.Ranges()
 
     def compute_message(self, skin: FollowedSkin, health: Index) -> bytes:
-        values = skin.newest.usable_values(health)
+        values = skin.newest.select_usable_values(health)
         residual = skin.newest.residual
         shown = self._quantity.of(values, residual)
         fixed = float(self.read_value("range"))

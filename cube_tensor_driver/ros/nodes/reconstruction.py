@@ -39,7 +39,7 @@ from ..node import CubeNode, run
 from ..qos import LATCHED, count_scans_per_message
 from .state_interfaces import make_state_interfaces
 from .stress_publisher import StressPublisher
-from .taring import Taring, tare_folder
+from .taring import Taring, find_tare_folder
 from .touch_publisher import TouchPublisher
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ class Reconstruction(CubeNode):
             self,
             skin,
             self._reconstructor,
-            None if recorded else tare_folder(self.read_value("tare_folder")),
+            None if recorded else find_tare_folder(self.read_value("tare_folder")),
             self._lock,
             self._publish_info,
         )

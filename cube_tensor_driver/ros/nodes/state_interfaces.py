@@ -27,7 +27,7 @@ from ...core.errors import ConfigError
 from ...core.forces import Forces
 from ...core.rows import StressRows
 from ...core.status import INVALID
-from ...core.tensor import contact_wrench
+from ...core.tensor import compute_contact_wrench
 from ...device.links.session import SILENT_S
 from ..messages import find_message_class, pack_array, to_time
 from ..node import CubeNode
@@ -103,9 +103,9 @@ class SkinWrenches:
         """
         rows = rows.select(rows.cube < len(self._wrench))
         sides = self._side[rows.cube, None]
-        force, torque = contact_wrench(rows.stress, rows.gradient, sides)
+        force, torque = compute_contact_wrench(rows.stress, rows.gradient, sides)
         wrench = np.hstack([force, torque])
-        # `contact_wrench` counts unknown components as 0, which would look like no load.
+        # `compute_contact_wrench` counts unknown components as 0, which would look like no load.
         is_invalid = rows.status & INVALID != 0
         wrench[is_invalid] = np.nan
         self._wrench[rows.cube] = wrench

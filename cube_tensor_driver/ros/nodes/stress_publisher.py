@@ -194,7 +194,7 @@ class ForceCloud:
         """
         if not self._publisher.get_subscription_count():
             return
-        force = self._forces.of_skin(rows)
+        force = self._forces.compute_in_parent_frame(rows)
         points = np.hstack([self._forces.position, force])
         point_bytes = points.astype("<f4").view(np.uint8)
         self._message.data = pack_array("B", point_bytes)
@@ -259,13 +259,13 @@ class CubeTopics:
         for row in np.flatnonzero(is_chosen).tolist():
             cube = int(rows.cube[row])
             left_out = int(rows.left_out[row])
-            covariance = self._reconstructor.covariance(cube, left_out)
+            covariance = self._reconstructor.compute_covariance(cube, left_out)
             header = self._make_header(rows, row, cube)
             message = make_tensor_message(header, rows, row, covariance)
             self._tensors.publish(cube, message)
 
     def _publish_wrenches(self, rows: StressRows, listened: list[int]) -> None:
-        # `contact_wrench` would compute the wrench 0 for an invalid row, which looks like the
+        # `compute_contact_wrench` would compute the wrench 0 for an invalid row, which looks like the
         # measurement of no load.
         is_listened = np.isin(rows.cube, listened)
         is_valid = rows.status & INVALID == 0
@@ -274,7 +274,7 @@ class CubeTopics:
         stress = rows.stress[chosen]
         gradient = rows.gradient[chosen]
         sides = self._sides[cubes][:, None]
-        forces, torques = contact_wrench(stress, gradient, sides)
+        forces, torques = compute_contact_wrench(stress, gradient, sides)
         each = zip(
             chosen.tolist(),
             cubes,
@@ -289,7 +289,7 @@ class CubeTopics:
 
     def _make_header(self, rows: StressRows, row: int, cube: int) -> Header:
         stamp = to_time(int(rows.stamp_ns[row]))
-        frame_id = self._skin.frame(self._skin.cubes[cube])
+        frame_id = self._skin.make_frame_id(self._skin.cubes[cube])
         return Header(stamp=stamp, frame_id=frame_id)
 
 

@@ -31,7 +31,7 @@ MAX_DATA_AGE_S = 1.0
 older data the request is refused, because the load on the skin may have changed since then."""
 
 
-def tare_folder(parameter: str) -> Path:
+def find_tare_folder(parameter: str) -> Path:
     """Return the folder of the tare files.
 
     Args:
