@@ -21,7 +21,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from .bags.reprocess.table import frequency_table, reprocess_table
+    from .bags.reprocess.table import read_frequency_table, reprocess_table
     from .bags.source import open_bag
     from .config.skin import read_skin
     from .core.errors import CubeError
@@ -41,7 +41,7 @@ __all__ = [
     "StressRows",
     "SurfaceInverse",
     "Touch",
-    "frequency_table",
+    "read_frequency_table",
     "open_bag",
     "open_links",
     "read_skin",
@@ -61,7 +61,7 @@ _HOMES = {
     "StressRows": ".core.rows",
     "SurfaceInverse": ".touch.inverse",
     "Touch": ".touch.touch_detection",
-    "frequency_table": ".bags.reprocess.table",
+    "read_frequency_table": ".bags.reprocess.table",
     "open_bag": ".bags.source",
     "open_links": ".device.live",
     "read_skin": ".config.skin",

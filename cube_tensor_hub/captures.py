@@ -120,5 +120,5 @@ class Oscillators:
         """
         stress, gradient = self._field_at(middle_us)
         # Boards have no common clock with the pads, so that the first edge comes at any phase.
-        millihertz = self.hub.frequency(stress, gradient, middle_us * 1e-6).ravel()
+        millihertz = self.hub.compute_frequency(stress, gradient, middle_us * 1e-6).ravel()
         return find_edges(millihertz, self._random.random(len(millihertz)))

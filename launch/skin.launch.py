@@ -22,8 +22,8 @@ from cube_tensor_driver.ros.launching import (
     check_arguments,
     declare_switch,
     declare_text,
+    prevent_restart,
     record_skin,
-    stay_ended,
     write_parameter_file,
     write_rviz_file,
 )
@@ -168,7 +168,7 @@ def make_action(process: Process, given: SkinArguments) -> Action:
         emulate_tty=True,
         respawn="respawn" in given.switched_on,
         respawn_delay=RESPAWN_DELAY_S,
-        on_exit=stay_ended,
+        on_exit=prevent_restart,
     )
 
 

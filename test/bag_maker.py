@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cube_tensor_driver.bags.metadata import make_typestore, quality
+from cube_tensor_driver.bags.metadata import describe_quality, make_typestore
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.config.calibration import format_calibration
 from cube_tensor_driver.config.skin import Elastomer, read_skin
@@ -149,8 +149,8 @@ def make_bag(
 
     with BagWriter(folder, **options) as writer:
         for topic, kind in (("/frequencies", FREQUENCIES), ("/stress", STRESS), ("/force", WRENCH)):
-            writer.add_topic(topic, kind, [quality(depth=100)])
-        writer.add_topic("/info", INFO, [quality(latched=True)])
+            writer.add_topic(topic, kind, [describe_quality(depth=100)])
+        writer.add_topic("/info", INFO, [describe_quality(latched=True)])
         put("/info", START_NS, info_of(skin, pipeline, START_NS))
         made = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
         for k in range(messages):

@@ -17,7 +17,7 @@ class HubInMemory(SimulatedHub):
     """What a hub does by itself, in one place, so that a test can break it."""
 
     def once_a_second(self, now_us: int) -> bytes:
-        return self.hello() + self.stats(now_us)
+        return self.make_hello() + self.make_stats(now_us)
 
     def on_the_line(self, data: bytes) -> bytes:
         """The last chance to change what goes out."""
@@ -49,7 +49,7 @@ class MemoryWire:
         self._hub = hub
         self._now_us = 0
         self._second_us = SECOND_US
-        self._out = bytearray(greeting + hub.on_the_line(hub.hello()))
+        self._out = bytearray(greeting + hub.on_the_line(hub.make_hello()))
 
     def now(self) -> float:
         return 1e-6 * self._now_us

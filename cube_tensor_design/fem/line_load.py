@@ -42,7 +42,7 @@ def compute_line_load(
     # The midpoints of equal intervals leave out k = 0, where the transfer function is a limit.
     midpoints = np.arange(WAVES) + 0.5
     k = midpoints * MAX_WAVENUMBER / depth / WAVES
-    transfer = layer.transfer(k, 0 * k, depth)
+    transfer = layer.compute_transfer(k, 0 * k, depth)
     transfer = transfer[:, :, [0, 2]]  # The columns of forces along x and z.
     modes_in_field = [FIELD.index(name) for name in PLANE.names]
     rows = transfer[:, modes_in_field]

@@ -116,7 +116,7 @@ def draw_influence(influence: Influence) -> Figure:
     reach = min(REACH * influence.side / 2, *np.abs(ends))
     x = np.linspace(-reach, reach, POINTS)
     along_x = np.eye(influence.place.shape[1])[0]
-    forces = influence.at(x[:, None] * along_x)
+    forces = influence.interpolate(x[:, None] * along_x)
     # The forces that are drawn press against z, or push along x.
     stress = forces[:, :, [-1, 0]] * [-1, 1]
     # A stress in Pa under 1 N/m has the same number in kPa under 1 N/mm.

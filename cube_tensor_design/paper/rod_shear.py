@@ -92,7 +92,7 @@ def recover_rod_shear(
     x = np.arange(-end, end + GRID_STEP / 2, GRID_STEP)
     layer = Layer(body.height, body.poisson)
     tensor_kernel = compute_line_load(layer, x, depth, body.side / 2)
-    pad_kernel = influence.at(x[:, None])
+    pad_kernel = influence.interpolate(x[:, None])
     shear_kernel = tensor_kernel[zx]
     from_tensor = _compute_shear_weights(
         tensor_kernel,

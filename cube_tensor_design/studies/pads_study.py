@@ -89,7 +89,7 @@ class LayerBench(TractionBench):
         place = np.einsum("nji,nsj->nsi", rotation, from_cube)[..., :2]
         local_forces = np.einsum("nji,sj->nsi", rotation, forces)
 
-        influence = self._true.at(place.reshape(-1, 2))[self._pads]
+        influence = self._true.interpolate(place.reshape(-1, 2))[self._pads]
         influence = influence.reshape(-1, len(rotation), len(sources), 3)
         # The pads p of cube n add up the point forces s.
         return np.einsum("pnsi,nsi->np", influence, local_forces)

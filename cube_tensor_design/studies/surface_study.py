@@ -137,7 +137,7 @@ def study_surface(
         points, parts = make_hertz_points(width / 2, 1 if layout.planar else 2)
         points[:, 0] += offset
         # The integral of influence functions and traction, by reciprocity.
-        pads = influence.at(points)[:, :, axis] @ (sign * parts)
+        pads = influence.interpolate(points)[:, :, axis] @ (sign * parts)
         measured = {name: float(row @ pads) for name, row in inverse.items()}
         if layout.planar:
             field = _compute_stress_in_plane(body, points[:, 0], parts)
@@ -208,7 +208,7 @@ def _compute_stress_in_space(
     layer = Layer(body.height, body.poisson)
     cubes = CubeMeasurement(layer, body.depth_of_cube, body.side / 2)
     from_load = np.array([[-offset, 0.0]])
-    field = ContactResponse(cubes).field(from_load, width / 2)[0]
+    field = ContactResponse(cubes).compute_field(from_load, width / 2)[0]
     return {name: field[FIELD.index(name)] for name in COMPONENTS}
 
 

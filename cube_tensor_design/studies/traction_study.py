@@ -210,7 +210,7 @@ class TractionBench:
         # For a layer, a table holds the fields under unit forces of a ball. The half space has a
         # closed form.
         if self._true_layer is not None:
-            unit_fields = self._true_layer.field(points - centre, width / 2)
+            unit_fields = self._true_layer.compute_field(points - centre, width / 2)
             return unit_fields @ force
         depth = self.setting.depth + self.setting.depth_error
         load = self.compute_point_forces(width, force, centre)
@@ -360,7 +360,7 @@ class TractionBench:
         points = self.inverse.points[self.window, :2]
         true = -self.compute_truth(points, width, force, centre)[:, 2]
         values = self.compute_values(width, force, centre, random)
-        interpolated = self.surface.contacts(values, CONTACT_PRESSURE)
+        interpolated = self.surface.find_contacts(values, CONTACT_PRESSURE)
         tracker, tracked, pressures = self._solve(values)
         errors = np.array(pressures)[:, self.window] - true
         mean_square = (true**2).mean()

@@ -153,7 +153,7 @@ class McapReader:
         """Close the file."""
         self._stream.close()
 
-    def messages(
+    def read_messages(
         self,
         topics: Collection[str],
         start_ns: int,

@@ -111,7 +111,7 @@ class FileSummary:
         return sum(connection.msgcount for connection in self.connections)
 
 
-def quality(
+def describe_quality(
     *,
     latched: bool = False,
     reliable: bool = True,
@@ -281,7 +281,7 @@ def make_bag_information(
     return {
         "version": METADATA_VERSION,
         "storage_identifier": storage,
-        **_time_span(start_ns, end_ns),
+        **_describe_time_span(start_ns, end_ns),
         "message_count": sum(file.msgcount for file in files),
         "topics_with_message_count": [
             _make_topic_information(connection)
@@ -293,7 +293,7 @@ def make_bag_information(
         "files": [
             {
                 "path": file.name,
-                **_time_span(file.start_ns, file.end_ns),
+                **_describe_time_span(file.start_ns, file.end_ns),
                 "message_count": file.msgcount,
             }
             for file in files
@@ -321,7 +321,7 @@ def merge_connections(of_files: Iterable[Sequence[Connection]]) -> list[Connecti
     return list(merged.values())
 
 
-def _time_span(start_ns: int, end_ns: int) -> dict[str, object]:
+def _describe_time_span(start_ns: int, end_ns: int) -> dict[str, object]:
     """Return begin and duration of a span of time with the keys of metadata.yaml.
 
     Args:

@@ -178,7 +178,7 @@ def serialise(kind: str, message: object) -> bytes:
     return bytes(make_typestore().serialize_cdr(message, kind))
 
 
-def stamp_ns(message: StampedMessage) -> int:
+def read_stamp_ns(message: StampedMessage) -> int:
     """Return the stamp in a message's header, in ns since the Unix epoch."""
     stamp = message.header.stamp
     return int(stamp.sec) * SECOND + int(stamp.nanosec)
@@ -271,7 +271,7 @@ class Bag:
         self._files.clear()
         self.connections = []
 
-    def topics(self, msgtype: str) -> list[str]:
+    def list_topics(self, msgtype: str) -> list[str]:
         """Return the sorted names of all topics with a message type."""
         names = {one.topic for one in self.connections if one.msgtype == msgtype}
         return sorted(names)
@@ -282,7 +282,7 @@ class Bag:
         Raises:
             BagError: The bag has no topic of frequencies, or has topics of several skins.
         """
-        names = [topic.removesuffix("frequencies") for topic in self.topics(FREQUENCIES)]
+        names = [topic.removesuffix("frequencies") for topic in self.list_topics(FREQUENCIES)]
         if not names:
             raise BagError(f"{self.path}: no topic of {FREQUENCIES}; record frequencies and info")
         if len(names) != 1:
@@ -292,7 +292,7 @@ class Bag:
             )
         return names[0]
 
-    def entries(
+    def read_entries(
         self,
         topics: set[str] | None = None,
         start_ns: int = 0,
@@ -327,7 +327,7 @@ class Bag:
     ) -> Iterator[tuple[McapReader | SqliteReader, StoredMessages]]:
         """Yield groups of successive messages, and the file in which they are.
 
-        Arguments and errors are those of `entries`.
+        Arguments and errors are those of `read_entries`.
         """
         wanted = {one.topic for one in self.connections}
         if topics is not None:
@@ -337,7 +337,7 @@ class Bag:
             # A recorder begins a new file after the last message of the one before, so messages of
             # different files need not be merged by time.
             for file in self._files:
-                for messages in file.messages(wanted, start_ns, stop_ns):
+                for messages in file.read_messages(wanted, start_ns, stop_ns):
                     count += len(messages)
                     groups: Iterable[StoredMessages] = [messages]
                     if self._is_packed:
@@ -381,7 +381,7 @@ class Bag:
             BagError: A file of the bag is damaged.
         """
         store = make_typestore()
-        for entry in self.entries(topics):
+        for entry in self.read_entries(topics):
             try:
                 if entry.msgtype not in store.fielddefs:
                     raise SerdeError(f"the type {entry.msgtype} is not known")
@@ -444,7 +444,7 @@ class Bag:
             )
         return [info for _, info in read if info.version == VERSION]
 
-    def frequencies(self, topic: str) -> Iterator[tuple[Decoded[FrequencyRows], Times]]:
+    def read_frequencies(self, topic: str) -> Iterator[tuple[Decoded[FrequencyRows], Times]]:
         """Read the frequencies on a topic in the order of recording.
 
         Successive messages with the same number of rows and the same frame id are decoded together.
@@ -462,7 +462,7 @@ class Bag:
             frequency_codec.decode,
         )
 
-    def stress(self, topic: str) -> Iterator[tuple[Decoded[StressRows], Times]]:
+    def read_stress(self, topic: str) -> Iterator[tuple[Decoded[StressRows], Times]]:
         """Read the recorded stress on a topic in the order of recording.
 
         Successive messages with the same number of rows and the same frame id are decoded together.
@@ -473,7 +473,7 @@ class Bag:
         """
         return self._decode_batches(topic, stress_codec, stress_codec.decode)
 
-    def columns(
+    def read_columns(
         self,
         topic: str,
         codec: MessageCodec[FrequencyRows] | MessageCodec[StressRows],

@@ -21,7 +21,7 @@ from ..core.rows import FrequencyRows, concatenate
 from ..messages.codec import Decoded
 from ..messages.compensation import read_motion, read_states
 from ..messages.types import COMPENSATION
-from .read import MAX_DISORDER_NS, Bag, stamp_ns
+from .read import MAX_DISORDER_NS, Bag, read_stamp_ns
 
 if TYPE_CHECKING:
     from ..msg import SkinCompensation
@@ -64,7 +64,7 @@ class CompensationReader:
         skin = topic.removesuffix("frequencies")
         self._bag = bag
         self._topic = f"{skin}compensation"
-        self.is_recorded = self._topic in bag.topics(COMPENSATION)
+        self.is_recorded = self._topic in bag.list_topics(COMPENSATION)
         self._forces = ForcesAtCubes(poses)
         self._restart()
 
@@ -142,7 +142,7 @@ class CompensationReader:
         topics = {self._topic} if self.is_recorded else set()
         message: SkinCompensation
         for time_ns, message in self._bag.read_decoded(topics):
-            at_ns = stamp_ns(message)
+            at_ns = read_stamp_ns(message)
             try:
                 motion = read_motion(message, at_ns)
                 states = read_states(message)

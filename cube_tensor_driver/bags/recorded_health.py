@@ -55,7 +55,7 @@ class _StressBatch(NamedTuple):
 class RecordedHealthReader:
     """Reads the health of pads for rows of frequencies from the recorded stress of the same skin.
 
-    Calls of `at` in the order of recording are fastest. For rows that are more than
+    Calls of `find` in the order of recording are fastest. For rows that are more than
     `MAX_DISORDER_NS` older than those of the previous call, the bag is read again from its start.
     """
 
@@ -76,7 +76,7 @@ class RecordedHealthReader:
         self._newest_ns = 0
         self._last_wanted_ns = 0
 
-    def at(self, rows: FrequencyRows) -> RecordedHealth:
+    def find(self, rows: FrequencyRows) -> RecordedHealth:
         """Return the recorded health (which pads were left out, and why) for rows of frequencies.
 
         The row of stress that belongs to a row of frequencies has the same cube, sequence number
@@ -154,10 +154,10 @@ class RecordedHealthReader:
 
         The bag is read from its beginning.
         """
-        if self._topic not in self._bag.topics(STRESS):
+        if self._topic not in self._bag.list_topics(STRESS):
             return
         names = ("cube", "sequence", "left_out", "status")
-        for columns in self._bag.columns(self._topic, stress_codec, names):
+        for columns in self._bag.read_columns(self._topic, stress_codec, names):
             stamp_ns, cube, sequence, left_out, status = columns
             if len(cube):
                 yield _StressBatch(

@@ -22,7 +22,7 @@ from ..core.rows import FrequencyRows, StressRows
 from ..core.tensor import rpy_from_quaternion
 from ..messages.skin_info import read_cube_calibrations, read_cube_poses, read_skin_elastomer
 from ..messages.types import INFO
-from .read import Bag, stamp_ns
+from .read import Bag, read_stamp_ns
 from .recorded_compensation import CompensationReader
 from .recorded_health import RecordedHealthReader
 
@@ -68,7 +68,7 @@ class Recording:
         self._bag = bag
         self.infos: list[SkinInfo] = []
         self.settings: list[Settings] = []
-        for info in sorted(find_skin_infos(bag, topic), key=stamp_ns):
+        for info in sorted(find_skin_infos(bag, topic), key=read_stamp_ns):
             try:
                 settings = read_settings(info)
                 read_cube_poses(info)
@@ -76,7 +76,7 @@ class Recording:
                 reason = error
                 bag.skip(
                     topic.replace("frequencies", "info"),
-                    stamp_ns(info),
+                    read_stamp_ns(info),
                     error,
                 )
             else:
@@ -84,7 +84,7 @@ class Recording:
                 self.settings.append(settings)
         if not self.infos:
             raise BagError(f"{bag.path}: {reason}") from None
-        since_ns = [stamp_ns(info) for info in self.infos]
+        since_ns = [read_stamp_ns(info) for info in self.infos]
         self._since_ns = np.array(since_ns)
         self.health = RecordedHealthReader(bag, topic)
         poses = read_cube_poses(self.infos[-1])
@@ -117,7 +117,7 @@ class Recording:
         index: Index = np.maximum(n_earlier - 1, 0)
         return index
 
-    def settings_at(self, rows: FrequencyRows) -> Settings:
+    def find_settings(self, rows: FrequencyRows) -> Settings:
         """Return the calibrations and rest frequencies that applied to the rows of one message.
 
         A rest frequency is the frequency of a pad without load; a row is one sample of one cube.
@@ -163,7 +163,7 @@ def find_skin_infos(bag: Bag, topic: str) -> list[SkinInfo]:
     try:
         infos = bag.read_infos(f"{skin}info")
     except BagError:
-        if driver_topic not in bag.topics(INFO):
+        if driver_topic not in bag.list_topics(INFO):
             raise
         infos = bag.read_infos(driver_topic)
     reconstructed = [info for info in infos if info.sender == "reconstruction"]

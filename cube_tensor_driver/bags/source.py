@@ -138,7 +138,7 @@ class BagSource:
         Raises:
             BagError: The bag is damaged.
         """
-        for messages, recorded_ns in self.bag.frequencies(self.topic):
+        for messages, recorded_ns in self.bag.read_frequencies(self.topic):
             # The health is read before messages are divided, because the recorded stress was
             # decoded in the same groups.
             health = self.recording.health.at(messages.rows) if use_health else None
@@ -235,7 +235,7 @@ def open_bag(path: Path | str, topic: str | None = None) -> BagSource:
     # The returned source closes the bag. If an error occurs before, the bag is closed here.
     bag = Bag(Path(path))
     try:
-        topics = bag.topics(FREQUENCIES)
+        topics = bag.list_topics(FREQUENCIES)
         if topic is None:
             topic = f"{bag.find_skin_prefix()}frequencies"
         elif topic not in topics:

@@ -121,7 +121,7 @@ class SqliteReader:
         """Close the file."""
         self._database.close()
 
-    def messages(
+    def read_messages(
         self,
         topics: Collection[str],
         start_ns: int,

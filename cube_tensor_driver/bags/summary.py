@@ -81,11 +81,11 @@ def summarise_cubes(bag: Bag, topic: str, n_cubes: int) -> Iterator[CubeSummary]
         )
 
 
-def last_diagnostics(bag: Bag) -> list[DiagnosticStatus]:
+def find_last_diagnostics(bag: Bag) -> list[DiagnosticStatus]:
     """Return the last recorded DiagnosticStatus of each name, sorted by name."""
     # Entries come in the order of recording, so a later status replaces an earlier one.
     last = {}
-    topics = set(bag.topics(DIAGNOSTICS_TYPE))
+    topics = set(bag.list_topics(DIAGNOSTICS_TYPE))
     message: DiagnosticArray
     for _, message in bag.read_decoded(topics):
         for status in message.status:

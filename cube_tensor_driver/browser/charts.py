@@ -76,7 +76,7 @@ GROUPS = {
     "all stresses": tuple(STRESS),
     "all gradients": tuple(COMPONENTS[len(STRESS) :]),
     "residual": ("residual",),
-    **{markup.label(name): (name,) for name in COMPONENTS},
+    **{markup.format_label(name): (name,) for name in COMPONENTS},
 }
 """Name of a group of values that a chart can show -> their names in `History.COLUMNS`.
 
@@ -101,10 +101,10 @@ class Chart(NamedTuple):
     unit: float
     lines: dict[str, tuple[int, int]]
 
-    def values(self, history: History) -> dict[str, Array]:
+    def select_values(self, history: History) -> dict[str, Array]:
         """Return the label of each line -> its values (M,) at the M instants of a history, in units
         of `unit`."""
-        return {label: history.of(*place) / self.unit for label, place in self.lines.items()}
+        return {label: history.select(*place) / self.unit for label, place in self.lines.items()}
 
 
 class Charts:
@@ -190,7 +190,7 @@ class Charts:
         if client is None or history is None:
             return
         if kind == "PNG":
-            panels = [(chart.axis, chart.values(history)) for chart in self._charts]
+            panels = [(chart.axis, chart.select_values(history)) for chart in self._charts]
             content = render_png(draw_panels(history.times, TIME_LABEL, panels))
         else:
             content = format_csv(history, self._cubes, self._names)
@@ -221,7 +221,7 @@ def make_chart(
     size, unit = find_component_unit(GROUPS[group][0])
     observed = [name for name in GROUPS[group] if name in history.observed_names]
     lines = {
-        f"{names[cube]} {markup.label(name)}": (cube, History.COLUMNS.index(name))
+        f"{names[cube]} {markup.format_label(name)}": (cube, History.COLUMNS.index(name))
         for cube, name in list(product(cubes, observed))[:MAX_LINES]
     }
     return Chart(f"{group} / {unit}", size, lines)
@@ -234,7 +234,7 @@ def make_chart_properties(history: History, chart: Chart) -> dict[str, object]:
         history: Values of all cubes in the last seconds.
         chart: What the plot shows.
     """
-    values = chart.values(history)
+    values = chart.select_values(history)
     if not values:
         return {}
     # The range is computed here, because uPlot cannot compute it from values with NaN.
@@ -297,7 +297,7 @@ def format_csv(
             if name in history.observed_names:
                 unit = "1" if name == "residual" else "Pa/m" if "_" in name else "Pa"
                 header.append(f"{names[cube]} {name} / {unit}")
-                columns.append(history.of(cube, column))
+                columns.append(history.select(cube, column))
     content = io.BytesIO()
     np.savetxt(
         content,

@@ -100,7 +100,7 @@ class ServiceCalls:
         future = client.call_async(request)
         self._open.append(_Call(what, future, time.monotonic(), notes_success))
 
-    def awaits(self, what: str) -> bool:
+    def is_waiting_for(self, what: str) -> bool:
         """Return whether a call with this name has neither been answered nor timed out."""
         return any(call.what == what for call in self._open)
 
@@ -169,7 +169,7 @@ class ReplayClient:
 
         Until then the position in `state` is not the one that the user has chosen.
         """
-        is_wanted = self._wanted_position is not None or self._services.awaits(JUMP)
+        is_wanted = self._wanted_position is not None or self._services.is_waiting_for(JUMP)
         return self.state is not None and is_wanted
 
     def toggle_hold(self) -> None:
@@ -204,7 +204,7 @@ class ReplayClient:
             Whether a jump was sent in this call.
         """
         self._services.update()
-        if self._wanted_position is None or self._services.awaits(JUMP):
+        if self._wanted_position is None or self._services.is_waiting_for(JUMP):
             return False
         if self.state is None or not self._client.service_is_ready():
             if time.monotonic() > self._wanted_s + MAX_ANSWER_S:

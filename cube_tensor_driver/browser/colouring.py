@@ -35,7 +35,7 @@ class Colouring(NamedTuple):
     above: Array | None
 
     @classmethod
-    def of(
+    def from_scan(
         cls,
         scan: Scan,
         surface: Surface,

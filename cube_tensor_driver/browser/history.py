@@ -79,7 +79,7 @@ class History:
         self._instants.clear()
         self._is_observed[:] = False
 
-    def of(self, cube: int, column: int) -> Array:
+    def select(self, cube: int, column: int) -> Array:
         """Return one value of a cube at the M stored instants (M,), in SI units, the oldest first.
 
         Args:

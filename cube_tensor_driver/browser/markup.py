@@ -132,7 +132,7 @@ def put_in_box(content: str) -> str:
     return _make_div(BOX_STYLE, content)
 
 
-def label(name: str) -> str:
+def format_label(name: str) -> str:
     """Return the symbol of a component: σzz for the stress zz, ∂σzz/∂x for the gradient zz_x.
 
     Args:
@@ -279,7 +279,7 @@ def make_numbers_table(scan: Scan, cube: int, above: Array | None) -> str:
     for name, si_value in zip(COMPONENTS, scan.values[cube], strict=True):
         size, unit = scene.find_component_unit(name)
         if np.isfinite(si_value):
-            rows.append((label(name), f"{si_value / size:+.3f}", unit))
+            rows.append((format_label(name), f"{si_value / size:+.3f}", unit))
     if above is not None and np.isfinite(above).all():
         pressure, deviation = 1e-3 * above
         rows.append(("on the surface", f"{pressure:.2f} ± {deviation:.2f}", "kPa"))

@@ -24,11 +24,11 @@ from ..views.meshes import (
     CUBE_EDGES,
     NO_MESH,
     compute_square_corners,
+    compute_step_colours,
     find_hit_cube,
     make_corner_lines,
     make_cube,
     paint_squares,
-    step_colours,
 )
 from ..views.round_numbers import round_down
 from .colouring import Colouring
@@ -179,12 +179,12 @@ class Placement:
         self.pitch = poses.pitch * self.unit
         self.arrow = max(self.pitch, MIN_ARROW_UNIT)
         self.poses = CubePoses(
-            self.point(poses.position),
+            self.transform(poses.position),
             poses.rotation,
             poses.half_side * self.unit,
         )
 
-    def point(self, position: Array) -> Array:
+    def transform(self, position: Array) -> Array:
         """Transform positions (..., 3) from the parent frame, in metres, to units of the scene."""
         return (position - self.centre) * self.unit
 
@@ -222,7 +222,7 @@ class Scene:
         )
         # The points of the field are drawn at the lower faces of the cubes, so contacts are too.
         self._contact_depth = surface.depth * placement.unit + placement.poses.half_side.mean()
-        points = placement.point(surface.points)
+        points = placement.transform(surface.points)
         self._low = points.min(axis=0)
         self._high = points.max(axis=0)
 
@@ -371,7 +371,7 @@ class Scene:
             top,
             visible,
         )
-        colours_of_steps = step_colours(quantity).tolist()
+        colours_of_steps = compute_step_colours(quantity).tolist()
         for step, mesh in enumerate(meshes):
             colour = tuple(colours_of_steps[step])
             vertices, faces = mesh
@@ -444,7 +444,7 @@ class Scene:
             radius_m = float(np.sqrt(contact.area / np.pi))
             radius = max(radius_m * placement.unit, MIN_RING)
             # The ring lies in the plane of the drawn field, so that it encloses the load there.
-            centre = placement.point(contact.position) - self._contact_depth * contact.normal
+            centre = placement.transform(contact.position) - self._contact_depth * contact.normal
             rings.append(
                 scene.make_ring(
                     centre,
@@ -565,7 +565,7 @@ def _make_squares(
     poses, of_cube = placement.poses, surface.cube
     # The field is drawn at the lower faces of the cubes, so that it does not hide them.
     down = poses.rotation[of_cube, :, 2] * poses.half_side[of_cube, None]
-    points = placement.point(surface.points) - down
+    points = placement.transform(surface.points) - down
     rotation = poses.rotation[of_cube]
     side = np.full(len(points), surface.spacing * placement.unit)
     if with_cubes:

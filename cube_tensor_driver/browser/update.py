@@ -113,7 +113,7 @@ def build_update(
         Name of an object on the page -> its properties; upper ends of the ranges in this picture.
     """
     cube = settings.cube
-    colouring = Colouring.of(
+    colouring = Colouring.from_scan(
         scan,
         skin.surface,
         settings.quantity,

@@ -351,7 +351,7 @@ def make_scan(
     values = latest.select_usable_values(health)
     contacts = scans.contacts
     if contacts is None:
-        contacts = skin.surface.contacts(values, CONTACT_PRESSURE)
+        contacts = skin.surface.find_contacts(values, CONTACT_PRESSURE)
     return Scan(
         values=values,
         residual=latest.residual.copy(),

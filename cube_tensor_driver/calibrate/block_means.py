@@ -76,7 +76,7 @@ class BlockMeans:
                 np.add.at(self._sums, place, values[is_used])
                 np.add.at(self.counts, place, 1)
 
-    def of_cube(self, cube: int) -> tuple[Array, Array, Array]:
+    def select_cube(self, cube: int) -> tuple[Array, Array, Array]:
         """Return the means of one cube, for the n blocks in which it has rows.
 
         Returns:

@@ -36,7 +36,7 @@ from ..core.compensation.models import CreepModel
 from ..core.errors import FitError
 from ..messages.codec import SECOND
 from .block_means import find_lags
-from .fit import measured_stress
+from .fit import compute_measured_stress
 from .recorded_loads import average_neighbours, find_cube, read_samples
 
 TIMES_PER_DECADE = 2.0
@@ -190,7 +190,7 @@ def fit_recorded_creep(
     is_complete = np.isfinite(frequency).all(axis=1)
     stamp_ns = stamp_ns[is_complete]
     known = temperature[is_complete] if np.isfinite(temperature).all() else None
-    reading = measured_stress(current, frequency[is_complete], known)
+    reading = compute_measured_stress(current, frequency[is_complete], known)
     seconds = (stamp_ns - stamp_ns[:1]) / SECOND
     is_loaded = ~calibration.layout.is_dummy
     pads = tuple(itertools.compress(calibration.layout.pads, is_loaded))

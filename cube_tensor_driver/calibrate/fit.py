@@ -128,7 +128,7 @@ class Fit:
         )
 
 
-def measured_stress(
+def compute_measured_stress(
     base: Calibration,
     frequency: ArrayLike,
     temperature: Real | None = None,
@@ -232,7 +232,7 @@ def fit(
     design = model.compute_design(x)
     theta, weights, scale = model.solve(design, y)
 
-    jacobian = model.jacobian(theta, design)
+    jacobian = model.compute_jacobian(theta, design)
     null = find_null_space(jacobian)
     n_free = len(model.free)
     is_open = find_undetermined(null, n_free)
@@ -363,7 +363,7 @@ class _Model:
         readings: Array = gain * (design @ coefficients)
         return readings
 
-    def jacobian(
+    def compute_jacobian(
         self,
         theta: Array,
         design: Array,
@@ -420,7 +420,7 @@ class _Model:
                 # Multiplying each row by the root of its weight turns weighted least squares into
                 # ordinary least squares.
                 root = np.sqrt(weights)
-                jacobian = self.jacobian(theta, design)
+                jacobian = self.compute_jacobian(theta, design)
                 weighted = root[:, None] * jacobian
                 step = solve_least_squares(weighted, root * r)
                 theta = theta + step
@@ -578,7 +578,7 @@ def _advise(
         results = []
         for mode, load in enumerate(single_modes):
             candidate = np.vstack([loads, load])
-            jacobian = model.jacobian(theta, model.compute_design(candidate))
+            jacobian = model.compute_jacobian(theta, model.compute_design(candidate))
             new_null = find_null_space(jacobian)
             new_open = find_undetermined(new_null, len(names))
             # The best load leaves the fewest coefficients undetermined. Among loads that are equal

@@ -145,9 +145,9 @@ class ThermalFit:
         deviation = np.array(self.model.deviation)
         change = self.data.stress - self.offset
         return (
-            root_mean_square(change),
-            root_mean_square(self.residual),
-            root_mean_square(deviation[:, 0]),
+            compute_root_mean_square(change),
+            compute_root_mean_square(self.residual),
+            compute_root_mean_square(deviation[:, 0]),
         )
 
     def make_calibration(self, base: Calibration, source: str) -> Calibration:
@@ -250,7 +250,7 @@ def fit_thermal(data: Warming) -> ThermalFit:
     return best
 
 
-def root_mean_square(values: Array) -> float:
+def compute_root_mean_square(values: Array) -> float:
     """Return the root of the mean of the squares of values (...)."""
     return float(np.sqrt((values**2).mean()))
 
@@ -365,7 +365,7 @@ def _check(
         change: Relative difference between `slope` and the rms with the weights of the fit.
     """
     data, model = fit.data, fit.model
-    worst = max(root_mean_square(pad) for pad in fit.residual.T)
+    worst = max(compute_root_mean_square(pad) for pad in fit.residual.T)
     stated = fit.compute_sizes()[2]
     size = max(stated / slope, change)
     fix = (

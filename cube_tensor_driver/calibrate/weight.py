@@ -81,7 +81,7 @@ def fit_weight(path: Path, name: str | None = None) -> WeightFit:
     if any(blocks.calibrations[cube].id != base.id for cube in others):
         raise BagError(f"{path}: its cubes have different calibrations; name one with --cube")
     fits = [
-        _fit_cube(*blocks.of_cube(cube), f"{path}: cube {blocks.names[cube]}")
+        _fit_cube(*blocks.select_cube(cube), f"{path}: cube {blocks.names[cube]}")
         for cube in blocks.cubes
     ]
     gain = base.gain[:, None]

@@ -73,7 +73,7 @@ def show_bag(path: Path) -> None:
     import numpy as np
 
     from ..bags.read import Bag
-    from ..bags.summary import last_diagnostics
+    from ..bags.summary import find_last_diagnostics
     from ..messages.types import FREQUENCIES
     from ..views.terminal.output import say
 
@@ -89,9 +89,9 @@ def show_bag(path: Path) -> None:
             say(f"{path}: no messages")
 
         show_topics(bag, duration_s)
-        for topic in bag.topics(FREQUENCIES):
+        for topic in bag.list_topics(FREQUENCIES):
             show_skin(bag, topic)
-        for status in last_diagnostics(bag):
+        for status in find_last_diagnostics(bag):
             say(format_diagnostics(status))
 
 

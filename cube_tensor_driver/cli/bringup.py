@@ -215,7 +215,7 @@ def watch_rest(source: LinkSource) -> PadsAtRest:
             columns = zip(*parts, strict=True)
             frequency, seconds = map(np.concatenate, columns)
             rest = measure_pads_at_rest(frequency, seconds)
-            table = pad_table(rest, source.skin)
+            table = tabulate_pads(rest, source.skin)
             live.update(table, refresh=True)
             if is_over:
                 break
@@ -295,7 +295,7 @@ def press_cubes(source: LinkSource, rest: PadsAtRest) -> dict[int, Explanation]:
     return explanations
 
 
-def pad_table(rest: PadsAtRest, skin: Skin) -> Table:
+def tabulate_pads(rest: PadsAtRest, skin: Skin) -> Table:
     """Return the table of the pads of a skin.
 
     Args:
@@ -319,7 +319,7 @@ def pad_table(rest: PadsAtRest, skin: Skin) -> Table:
                 f"{PPM * rest.drift[cube, pad]:+.0f}",
             )
         name = skin.names[cube] if pad == 0 else ""
-        fault = pad_fault(rest, cube, pad)
+        fault = find_pad_fault(rest, cube, pad)
         style = "red" if fault else ""
         table.add_row(
             name,
@@ -331,7 +331,7 @@ def pad_table(rest: PadsAtRest, skin: Skin) -> Table:
     return table
 
 
-def pad_fault(rest: PadsAtRest, cube: int, pad: int) -> str:
+def find_pad_fault(rest: PadsAtRest, cube: int, pad: int) -> str:
     """Return the fault of a pad: "silent", "stuck" or "noisy"; an empty text if it has none.
 
     Args:

@@ -122,7 +122,7 @@ def run_table(options: argparse.Namespace) -> None:
 
     import numpy as np
 
-    from ..calibrate.fit import fit, measured_stress
+    from ..calibrate.fit import compute_measured_stress, fit
     from ..config.calibration import find_named_layout
     from ..config.output_files import write_json
     from ..core.errors import ConfigError
@@ -144,7 +144,7 @@ def run_table(options: argparse.Namespace) -> None:
     # response of the pads. Their average has given the rest frequencies.
     loaded = loads.state.any(axis=1)
     temperature = None if loads.temperature is None else loads.temperature[loaded]
-    measured = measured_stress(base, loads.frequency[loaded], temperature)
+    measured = compute_measured_stress(base, loads.frequency[loaded], temperature)
     structure = find_structure(layout, options.symmetry)
     result = fit(
         structure,

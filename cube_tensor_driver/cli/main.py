@@ -164,7 +164,7 @@ def make_command_parser(name: str) -> Parser:
 
 def make_help_text() -> str:
     """Return the text of ./cube --help: all commands in groups, wrapped to the terminal's width."""
-    width = columns()
+    width = find_help_width()
     indent = max(map(len, COMMANDS)) + 4
     lines = [
         f"usage: {PROGRAM} COMMAND [OPTION ...]",

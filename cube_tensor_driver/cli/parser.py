@@ -240,10 +240,10 @@ class Parser(argparse.ArgumentParser):
 
 def make_formatter(prog: str) -> argparse.HelpFormatter:
     """Return a formatter of help texts for the width of the terminal."""
-    return argparse.HelpFormatter(prog, width=columns() - 2)
+    return argparse.HelpFormatter(prog, width=find_help_width() - 2)
 
 
-def columns() -> int:
+def find_help_width() -> int:
     """Return the width of help texts, in characters: that of the terminal, at most `MAX_WIDTH`."""
     return min(shutil.get_terminal_size().columns, MAX_WIDTH)
 
@@ -312,7 +312,7 @@ def check_outputs(options: argparse.Namespace) -> None:
     check_outputs(files)
 
 
-def _number_type(
+def _make_number_type(
     kind: Callable[[str], Number],
     what: str,
     is_allowed: Callable[[Number], bool],
@@ -335,35 +335,35 @@ def _number_type(
     return convert
 
 
-number = _number_type(float, "a finite number", math.isfinite)
-positive = _number_type(
+number = _make_number_type(float, "a finite number", math.isfinite)
+positive = _make_number_type(
     float,
     "a number above 0",
     lambda x: 0 < x < math.inf,
 )
-not_negative = _number_type(
+not_negative = _make_number_type(
     float,
     "a number of at least 0",
     lambda x: 0 <= x < math.inf,
 )
-sample_rate = _number_type(
+sample_rate = _make_number_type(
     float,
     "a rate from 0.1 to 10000 samples per second",
     # Hubs and skin files have the same limits.
     lambda rate: 0.1 <= rate <= 10_000,
 )
-count = _number_type(int, "a whole number of at least 1", lambda n: n >= 1)
-whole_number = _number_type(
+count = _make_number_type(int, "a whole number of at least 1", lambda n: n >= 1)
+whole_number = _make_number_type(
     int,
     "a whole number of at least 0",
     lambda n: n >= 0,
 )
-tcp_port = _number_type(
+tcp_port = _make_number_type(
     int,
     "a TCP port, 1 to 65535",
     lambda n: 1 <= n <= 65535,
 )
-uid = _number_type(
+uid = _make_number_type(
     # With base 0, `int` accepts decimal numbers, and hexadecimal numbers that begin with 0x.
     lambda text: int(text, 0),
     "a uid, 0 to 2^64 - 1",

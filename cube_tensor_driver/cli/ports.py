@@ -36,7 +36,7 @@ def run(options: argparse.Namespace) -> int:
         if hello is not None:
             print(
                 f"{name}: hub 0x{hello.hub_uid:x}, {hello.n_cubes} cubes of {hello.n_pads} pads, "
-                f"{rate(hello.period_us)}, firmware 0x{hello.firmware:x}"
+                f"{format_rate(hello.period_us)}, firmware 0x{hello.firmware:x}"
             )
         # The port could not be opened, because a driver uses it or this user has no permission.
         elif port.problem:
@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def rate(period_us: int) -> str:
+def format_rate(period_us: int) -> str:
     """Return the sample rate of a hub as text.
 
     Args:

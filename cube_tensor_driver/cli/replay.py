@@ -184,7 +184,7 @@ def run_browser(bag: Bag, wanted: bool) -> Iterator[Children]:
     ):
         if wanted:
             # The view can only show stress that is published; it does not compute any.
-            if not bag.topics(f"{PACKAGE}/msg/SkinStress"):
+            if not bag.list_topics(f"{PACKAGE}/msg/SkinStress"):
                 raise BagError(
                     f"{bag.path}: no stress to show; "
                     "./cube reprocess computes it from the frequencies"

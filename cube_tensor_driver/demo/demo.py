@@ -93,7 +93,7 @@ def run_demo(settings: DemoSettings) -> int:
         folder = Path(name)
         skin_file = choose_skin_file(settings, folder)
         # A hub to which the driver sends no rate takes no samples.
-        rate = settings.rate or rate_of_file(skin_file) or DEFAULT_RATE
+        rate = settings.rate or read_rate(skin_file) or DEFAULT_RATE
         hubs = SimulatedHubs(
             folder / "ports",
             load=settings.load,
@@ -187,7 +187,7 @@ def write_grid(
     return path
 
 
-def rate_of_file(skin_file: Path) -> float | None:
+def read_rate(skin_file: Path) -> float | None:
     """Return the samples per second that a skin file states; None if it states no number.
 
     The file is not checked here, because the check needs numpy; `watch` checks it later.

@@ -20,10 +20,10 @@ from ..core.modes import COMPONENTS
 from ..core.pipeline import Pipeline
 from ..core.rows import StressRows
 from ..simulation.cubes import compute_skin_components
-from ..simulation.load import AnyLoad, total
+from ..simulation.load import AnyLoad, compute_resultant
 from ..simulation.sample_log import SampleLog
 from ..touch.surface import Surface
-from .verification import Arrivals, Comparison, compare, percentile
+from .verification import Arrivals, Comparison, compare, compute_percentile
 
 MIN_TIMES_COMPARED = 500
 """Minimum number of sampling times that are compared with the load; a measurement with fewer times
@@ -92,7 +92,7 @@ class ForceHistory:
         return {
             "force_peak_n": peak.round(2).tolist(),
             "force_error_n": error.round(2).tolist(),
-            "centre_error_mm": round(1e3 * rms(distance), 2),
+            "centre_error_mm": round(1e3 * compute_rms(distance), 2),
         }
 
 
@@ -181,13 +181,13 @@ class LoadVerification:
             "samples_received": frequencies.received,
             "tensors_received": stress.received,
             "lost": stress.missing,
-            "latency_p50_ms": percentile(stress.latency_ms, 50),
-            "latency_p99_ms": percentile(stress.latency_ms, 99),
-            "stamp_error_p99_ms": percentile(stress.stamp_error_ms, 99),
+            "latency_p50_ms": compute_percentile(stress.latency_ms, 50),
+            "latency_p99_ms": compute_percentile(stress.latency_ms, 99),
+            "stamp_error_p99_ms": compute_percentile(stress.stamp_error_ms, 99),
             **self._compute_errors(stress),
         }
 
-    def forces(self) -> ForceHistory:
+    def compute_forces(self) -> ForceHistory:
         """Compute the force on the whole skin and its centre of pressure over time.
 
         Raises:
@@ -203,13 +203,13 @@ class LoadVerification:
 
         # The load is a function of simulated time, which is 0 at the start of the simulator.
         seconds = self._compute_seconds(times_ns)
-        applied = map(self.load.total, seconds.tolist())
+        applied = map(self.load.compute_resultant, seconds.tolist())
         force, centre, normal = map(np.array, zip(*applied, strict=True))
         # The contacts are found by interpolating the pressure between the cubes, as the node
         # `contacts` does with the method `interpolation`.
         surface = Surface(self.load.poses, self.load.depth)
-        contacts = [surface.contacts(one, CONTACT_PRESSURE) for one in values[is_complete]]
-        measured = map(total, contacts)
+        contacts = [surface.find_contacts(one, CONTACT_PRESSURE) for one in values[is_complete]]
+        measured = map(compute_resultant, contacts)
         measured_force, measured_centre, _ = map(np.array, zip(*measured, strict=True))
         return ForceHistory(
             seconds=seconds,
@@ -239,7 +239,7 @@ class LoadVerification:
         is_chosen = np.isin(comparison.taken_ns, times_ns)
         time = np.searchsorted(times_ns, comparison.taken_ns[is_chosen])
         rows = comparison.first[is_chosen]
-        cube = self._stress.columns()[0][rows]
+        cube = self._stress.collect_columns()[0][rows]
         shape = (len(times_ns), self._n_cubes, len(COMPONENTS))
         values = np.full(shape, np.nan)
         if len(rows):
@@ -280,9 +280,9 @@ class LoadVerification:
         varies = span > 0
         relative = error[..., varies] / span[varies]
         return {
-            "error_rel_rms": rms(relative),
+            "error_rel_rms": compute_rms(relative),
             "error_rel_worst": float(np.nanmax(np.abs(relative))),
-            "error_over_noise": rms(error / compute_component_noise(self._skin)),
+            "error_over_noise": compute_rms(error / compute_component_noise(self._skin)),
         }
 
     def _compute_truth(self, seconds: float) -> Array:
@@ -291,7 +291,7 @@ class LoadVerification:
         Args:
             seconds: Time after the start of the simulator, in s.
         """
-        return compute_skin_components(self._skin, *self.load.at(seconds))
+        return compute_skin_components(self._skin, *self.load.compute_stress_field(seconds))
 
 
 def rms(values: Real) -> float:

@@ -58,7 +58,7 @@ class Arrivals:
         table = np.array(columns, np.int64)
         self._parts.append(table[:, kept])
 
-    def columns(self) -> Index:
+    def collect_columns(self) -> Index:
         """Return four columns (4, N) of the stored rows, in the order of their arrival.
 
         Returns:
@@ -115,7 +115,7 @@ def compare(
         start_ns: Beginning of the period, in ns since the Unix epoch.
         end_ns: End of the period; samples taken at this time or later do not count.
     """
-    cube, sequence, stamp_ns, received_ns = arrivals.columns()
+    cube, sequence, stamp_ns, received_ns = arrivals.collect_columns()
     sample = taken.match(SampleKeys(cube, sequence, stamp_ns))
     matched = np.flatnonzero(sample != NO_MATCH)
     matched_ns = taken.time_ns[sample[matched]]
@@ -139,7 +139,7 @@ def compare(
     )
 
 
-def percentile(values: Array, percent: float) -> float:
+def compute_percentile(values: Array, percent: float) -> float:
     """Return a percentile of some values, rounded to three decimals; NaN if there are no values.
 
     Args:

@@ -88,7 +88,7 @@ class DemoResult:
         from ..views.figures.skin_force import draw_forces
         from ..views.figures.style import save
 
-        forces = self.verification.forces()
+        forces = self.verification.compute_forces()
         picture = draw_forces(
             seconds=forces.seconds,
             force=forces.force,

@@ -247,9 +247,9 @@ class RecordedWindows:
         Raises:
             BagError: The folder has no window with the number in the picture.
         """
-        return self.at(read_frame_number(picture))
+        return self.find_frame(read_frame_number(picture))
 
-    def at(self, number: int) -> dict[str, AnyArray]:
+    def find_frame(self, number: int) -> dict[str, AnyArray]:
         """Return the window that was stored under a frame number; result and errors as in `of`."""
         if number not in self._frames:
             raise BagError(f"no window has the number {number}; name the folder of this data set")

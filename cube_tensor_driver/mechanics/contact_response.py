@@ -67,7 +67,7 @@ class ContactResponse:
         if cubes.spectra is not cubes.point_spectra:
             self._response = self._tabulate_discs(cubes.spectra, bessel)
 
-        # For `compute_response_to_forces` and `sensitivity`, the tables are matrices with one
+        # For `compute_response_to_forces` and `compute_sensitivity`, the tables are matrices with one
         # row for each pair of a radius and a distance.
         width = 3 * len(self._order)
         rows = self._response.reshape(-1, width)
@@ -95,11 +95,11 @@ class ContactResponse:
         def compute() -> dict[str, Array]:
             radii = DISC_SIZES * self._depth
             loads = [compute_disc_spectrum(spectra.k * radius) for radius in radii]
-            return {"discs": spectra.radial(bessel, np.stack(loads))}
+            return {"discs": spectra.compute_radial_response(bessel, np.stack(loads))}
 
         return load_or_compute("discs", inputs, compute)["discs"]
 
-    def response(
+    def compute_response(
         self,
         place: Array,
         angle: Array,
@@ -215,7 +215,7 @@ class ContactResponse:
             holds the value, the derivative by the distance, and the first and second derivative by
             the natural logarithm of the radius.
         """
-        first, by_distance, distance_slope = self._table.weights(distance, 2)
+        first, by_distance, distance_slope = self._table.compute_weights(distance, 2)
         size_index = _find_size_index(size, self._depth)
         size_row, *by_size = compute_cubic_weights(size_index, 3)
 
@@ -272,7 +272,7 @@ class ContactResponse:
         )
         return self._cubes.measure(_split(circular), variant)[:, 0]
 
-    def sensitivity(
+    def compute_sensitivity(
         self,
         place: Array,
         angle: Array,
@@ -369,7 +369,7 @@ class ContactResponse:
         circular *= phases[:, None]
         return circular
 
-    def field(self, place: Array, size: float) -> Array:
+    def compute_field(self, place: Array, size: float) -> Array:
         """Compute stress and gradient under a Hertz contact with a force of 1 N.
 
         Args:

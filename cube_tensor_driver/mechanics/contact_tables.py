@@ -181,10 +181,10 @@ class DiscTables(_ContactTables):
         # The table has the axes radius, distance, force (radial, normal, tangential) and component.
         # The equations in circular.py contain the tangential force multiplied by i.
         factors = np.array([1, 1, 1j])[:, None]
-        table = spectra.radial(bessel, np.stack(disc_spectra)) * factors
+        table = spectra.compute_radial_response(bessel, np.stack(disc_spectra)) * factors
         return {"table": table.astype(np.complex64)}
 
-    def field(
+    def compute_field(
         self,
         position: ArrayLike,
         force: ArrayLike,
@@ -330,7 +330,7 @@ class PolygonTables(_ContactTables):
         r = np.arange(_LAST_DISTANCE + 2) / POINTS_PER_DEPTH
         bessel = tabulate_bessel(spectra.k, r * self.depth)
         point_force = np.ones((1, len(spectra.k)))
-        radial = spectra.radial(bessel, point_force)[0]
+        radial = spectra.compute_radial_response(bessel, point_force)[0]
         along, normal, across = radial.swapaxes(0, 1)
 
         distance = r[:, None]
@@ -341,7 +341,7 @@ class PolygonTables(_ContactTables):
         integrand *= distance[..., None]
         return CubicSpline(r, integrand).antiderivative()
 
-    def field(
+    def compute_field(
         self,
         start: ArrayLike,
         end: ArrayLike,

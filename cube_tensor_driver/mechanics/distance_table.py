@@ -72,7 +72,7 @@ class DistanceTable:
         index = np.arange(-1.0, self.last + 3)
         self.distances = index * self.step
 
-    def weights(
+    def compute_weights(
         self,
         distance: Array,
         count: int = 1,
@@ -122,7 +122,7 @@ class DistanceTable:
         Returns:
             Values (N, ...).
         """
-        first, weights = self.weights(distance)
+        first, weights = self.compute_weights(distance)
         value_axes = (1,) * (table.ndim - 1)
         weights = weights.reshape(4, len(distance), *value_axes)
         terms = []

@@ -70,7 +70,7 @@ class Influence:
     place: Array
     pads: Array
 
-    def at(self, place: Array) -> Array:
+    def interpolate(self, place: Array) -> Array:
         """Interpolate the pad stresses between the positions of the grid, with cubic splines.
 
         Args:

@@ -85,7 +85,7 @@ class Layer:
                 "the thickness"
             )
 
-    def transfer(
+    def compute_transfer(
         self,
         kx: Array,
         ky: Array,

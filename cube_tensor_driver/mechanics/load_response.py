@@ -70,7 +70,7 @@ class LoadResponse:
         for kx in k[count:, None]:
             wavenumber = np.hypot(kx, k)
             load = compute_disc_spectrum(wavenumber * width / 2) * cell
-            transfer = layer.transfer(kx, k, depth)
+            transfer = layer.compute_transfer(kx, k, depth)
             response = load[:, None, None] * transfer
             amplitude = response.sum(axis=0)
 

@@ -143,7 +143,7 @@ class CubeMeasurement:
         measured = flat @ matrices[0]
         return np.asarray(measured.reshape(n, loads, -1))
 
-    def matrices_towards(
+    def compute_matrices(
         self,
         angle: Array,
         variant: Index,

@@ -74,7 +74,7 @@ class Spectra:
     minus: Array
     normal: Array
 
-    def radial(self, bessel: BesselTable, load_spectra: Array) -> Array:
+    def compute_radial_response(self, bessel: BesselTable, load_spectra: Array) -> Array:
         """Compute the response at given distances from forces distributed over the surface.
 
         Args:
@@ -117,7 +117,7 @@ class Spectra:
             axis=2,
         )
 
-    def covariance(
+    def compute_covariance(
         self,
         other: Spectra,
         bessel: BesselTable,
@@ -273,7 +273,7 @@ def compute_layer_spectra(
         ElasticError: The layer does not contain this depth.
     """
     k, weight = make_wavenumber_quadrature(waves_of or depth)
-    along_x = layer.transfer(k, np.zeros_like(k), depth)
+    along_x = layer.compute_transfer(k, np.zeros_like(k), depth)
     circular = np.einsum("cf,kfi->kci", CIRCULAR_FROM_FIELD, along_x)
 
     # Under a traction F that is a wave along x, a component c of order m is given by

@@ -112,23 +112,23 @@ class TractionPrior:
         prior = _compute_prior_spectrum(spectra.k * depth) * depth**2
         shear, normal = SHEAR_RATIO**2, 1.0
         axis_variance = np.array([shear, normal, shear])
-        radial = spectra.radial(bessel, prior[None])[0]
+        radial = spectra.compute_radial_response(bessel, prior[None])[0]
         cross = radial * axis_variance[:, None]
 
-        real, imaginary = spectra.covariance(
+        real, imaginary = spectra.compute_covariance(
             spectra,
             bessel,
             prior,
             SHEAR_RATIO,
         )
-        with_points, _ = spectra.covariance(
+        with_points, _ = spectra.compute_covariance(
             points,
             bessel,
             prior,
             SHEAR_RATIO,
         )
         at_zero = tabulate_bessel(spectra.k, np.zeros(1))
-        own, _ = points.covariance(points, at_zero, prior, SHEAR_RATIO)
+        own, _ = points.compute_covariance(points, at_zero, prior, SHEAR_RATIO)
         return {
             "cross": cross,
             "real": real,
@@ -137,7 +137,7 @@ class TractionPrior:
             "own": own[0, _CIRCULAR_ZZ, _CIRCULAR_ZZ],
         }
 
-    def cross(
+    def compute_traction_covariance(
         self,
         place: Array,
         angle: Array,
@@ -160,7 +160,7 @@ class TractionPrior:
         measured = self._cubes.measure(circular, variant)
         return np.asarray(measured.swapaxes(1, 2))
 
-    def covariance(
+    def compute_covariance(
         self,
         place: Array,
         angle: Array,
@@ -181,8 +181,8 @@ class TractionPrior:
             Covariance (N, 15, 15) for a pressure of variance 1 Pa^2.
         """
         distance, direction = to_polar(place)
-        first = self._cubes.matrices_towards(direction - angle, variant)
-        second = self._cubes.matrices_towards(direction - other_angle, other_variant)
+        first = self._cubes.compute_matrices(direction - angle, variant)
+        second = self._cubes.compute_matrices(direction - other_angle, other_variant)
 
         n_components = len(COMPONENTS)
         total = np.zeros((len(place), n_components, n_components))
@@ -192,7 +192,7 @@ class TractionPrior:
             total += left @ circular @ right.swapaxes(1, 2)
         return total
 
-    def pressure(
+    def compute_pressure_covariance(
         self,
         place: Array,
         angle: Array,
@@ -213,7 +213,7 @@ class TractionPrior:
         """
         distance, direction = to_polar(place)
         covariance = self._table.interpolate(self._pressure, distance)
-        real, _ = self._cubes.matrices_towards(direction - angle, variant)
+        real, _ = self._cubes.compute_matrices(direction - angle, variant)
         measured = real @ covariance[:, :, None]
         return np.asarray(measured[:, :, 0])
 

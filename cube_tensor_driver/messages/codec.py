@@ -182,7 +182,7 @@ class Decoded(Generic[AnyRows]):
 class MessageBuffer(Generic[AnyRows]):
     """Memory of a serialised message with fixed numbers of rows and pads, which is used repeatedly.
 
-    The caller writes values into `rows` and calls `data` to get the bytes of the message.
+    The caller writes values into `rows` and calls `encode` to get the bytes of the message.
 
     Args:
         codec: Codec of the type of message.
@@ -205,7 +205,7 @@ class MessageBuffer(Generic[AnyRows]):
         self.rows: AnyRows = codec.make_rows(self._record, stamp_ns)
         self._time_offset = self._record["time_offset"][0]
 
-    def data(self, stamp_ns: int | None = None) -> bytes:
+    def encode(self, stamp_ns: int | None = None) -> bytes:
         """Return the bytes of the message with the values that `rows` has now.
 
         Args:
@@ -298,7 +298,7 @@ class MessageCodec(Generic[AnyRows]):
         end = _align(_FRAME_AT + frame) + 4
         return data[SHAPE_AT:end]
 
-    def buffer(
+    def make_buffer(
         self,
         frame_id: bytes,
         rows: int,

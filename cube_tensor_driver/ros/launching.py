@@ -222,7 +222,7 @@ def _list_recorded_topics(
     return qualities
 
 
-def stay_ended(event: ProcessExited, context: LaunchContext) -> Action | None:
+def prevent_restart(event: ProcessExited, context: LaunchContext) -> Action | None:
     """Return the action that prevents a restart (`respawn`) of a node that ended with `EX_CONFIG`.
 
     The exit code `EX_CONFIG` (78) means that a parameter or a file cannot be used. After a restart

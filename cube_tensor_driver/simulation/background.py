@@ -115,6 +115,6 @@ class _SetLoad:
     repeats: float | None = None
     period: float = 0.0
 
-    def at(self, seconds: float) -> StressField:
+    def compute_stress_field(self, seconds: float) -> StressField:
         """Return the stress and gradient that were set last."""
         return self.field

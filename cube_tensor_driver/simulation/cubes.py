@@ -102,14 +102,14 @@ class SimulatedCubes:
             response = read_weight(imperfections.weight, self.n_pads)
             self.heavy = HeavyPads(response, poses, imperfections.poses)
 
-    def temperature(self, seconds: float) -> float:
+    def compute_temperature(self, seconds: float) -> float:
         """Return the temperature, in °C, that the hub measures at a simulated time in s.
 
         It is NaN if it is unknown.
         """
         return math.nan if self._thermal is None else self._thermal.measure(seconds)
 
-    def frequency(
+    def compute_frequency(
         self,
         stress: Array,
         gradient: Array,
@@ -137,11 +137,11 @@ class SimulatedCubes:
         rest, beta, modulus = self._law
         rest = rest * (1 + self._drift * seconds)
         if self._thermal is not None:
-            thermal_stress, warm = self._thermal.at(seconds)
+            thermal_stress, warm = self._thermal.compute_effect(seconds)
             pad_stress += thermal_stress
             rest *= warm
         if self.heavy is not None:
-            pad_stress += self.heavy.stress(seconds)
+            pad_stress += self.heavy.compute_stress(seconds)
         # Imperfections change the stress that determines a pad's frequency.
         reported = self._behaviour.compute_reported(pad_stress, seconds)
         hertz = compute_pad_frequency(
@@ -176,7 +176,7 @@ class HubCubes:
         """Indices in the skin of the hub's cubes, without absent ones, in the order of the hub."""
         return np.asarray(self.members[self.members != ABSENT])
 
-    def frequency(
+    def compute_frequency(
         self,
         stress: Array,
         gradient: Array,
@@ -197,7 +197,7 @@ class HubCubes:
         frequency = np.full(shape, NOT_MEASURED, "<u4")
         in_skin = self.members != ABSENT
         cubes = self.skin_cubes
-        frequency[in_skin] = self.cubes.frequency(
+        frequency[in_skin] = self.cubes.compute_frequency(
             stress[cubes],
             gradient[cubes],
             seconds,

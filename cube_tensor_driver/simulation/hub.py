@@ -94,7 +94,7 @@ class SimulatedHub:
     _drift_since_us: int = 0
     runs: list[SampleRun] = field(default_factory=list)
 
-    def hello(self) -> bytes:
+    def make_hello(self) -> bytes:
         """Return the HELLO frame, the description of the hub and its cubes."""
         uid = self.uid if self.false_uid is None else self.false_uid
         n_pads = self.n_pads + self.extra_pads
@@ -110,7 +110,7 @@ class SimulatedHub:
             self.version,
         )
 
-    def stats(self, now_us: int) -> bytes:
+    def make_stats(self, now_us: int) -> bytes:
         """Return the STATS frame, the hub's counters, at simulated time `now_us`."""
         uptime_ms = self._compute_positive_device_us(now_us) // 1000
         sequence = self.sequence & _UINT32_MASK
@@ -237,7 +237,7 @@ class SimulatedHub:
         match request.request:
             case Command.HELLO:
                 ack = encode(Ack(request.request), self.version)
-                return ack + self.hello()
+                return ack + self.make_hello()
             case Command.TIME:
                 device_us = self._compute_positive_device_us(now_us)
                 return encode(Time(request.argument, device_us), self.version)

@@ -85,7 +85,7 @@ class SimulatedLink:
         newest = self.hub.sequence - 1
         self.damaged.append((self.hub.boots, newest))
 
-    def load_us(self, now_us: int) -> int:
+    def find_load_time_us(self, now_us: int) -> int:
         """Return the simulated time, in µs, whose load acts on the cubes of the hub.
 
         It is earlier than the present time `now_us` during the fault `hold`, which keeps the load
@@ -103,7 +103,7 @@ class SimulatedLink:
         """
         self.held_back = b""
         self.hub.reset(now_us, sequence)
-        self.line.send(self.hub.hello(), now_us)
+        self.line.send(self.hub.make_hello(), now_us)
 
     def update_hub(self) -> None:
         """Set the uid, pads, protocol version and failed pads that the hub reports under faults."""

@@ -44,7 +44,7 @@ _FAR_RATIO = 0.15
 this ratio, one ring of point forces represents the contact accurately enough for this cube."""
 
 
-def default_script() -> Script:
+def read_default_script() -> Script:
     """Read the load script in the package, in which an indenter moves over a skin of any size."""
     return read_script(find_package_data() / "config" / "load_demo.yaml")
 
@@ -87,7 +87,7 @@ class Fields(Protocol):
     def period(self) -> float:
         """Time in s after which the load repeats; if it never does, a typical duration instead."""
 
-    def at(self, seconds: float) -> StressField:
+    def compute_stress_field(self, seconds: float) -> StressField:
         """Compute stress and gradient at the cubes at a simulated time in s.
 
         Returns:
@@ -107,7 +107,7 @@ class AnyLoad(Fields, Protocol):
     def depth(self) -> float:
         """Distance from the centres of the cubes to the surface, in m."""
 
-    def total(self, seconds: float) -> Resultant:
+    def compute_resultant(self, seconds: float) -> Resultant:
         """Return the resultant of all contacts at a time, in the skin's parent frame.
 
         It consists of the total force (3,) in N, the centre of pressure (3,) in m, and the mean
@@ -138,7 +138,7 @@ def read_load(
         from .mujoco.scene import MujocoLoad
 
         return MujocoLoad(scene, skin)
-    return Load(skin, default_script() if script is None else read_script(script))
+    return Load(skin, read_default_script() if script is None else read_script(script))
 
 
 class Load:
@@ -193,7 +193,7 @@ class Load:
         for indenter in script.indenters:
             self._check(indenter)
 
-    def at(self, seconds: float) -> StressField:
+    def compute_stress_field(self, seconds: float) -> StressField:
         """Compute stress (cubes, 6) in Pa and gradient (cubes, 6, 3) in Pa/m at a time in s."""
         # For each cube, the surface is the plane z = 0, and the cube is at z = -depth.
         position, rotation, _ = self.poses
@@ -249,9 +249,9 @@ class Load:
         # touch the skin.
         return [load for load in loads if load.force.any()]
 
-    def total(self, seconds: float) -> Resultant:
+    def compute_resultant(self, seconds: float) -> Resultant:
         """Return total force, centre of pressure and mean normal of all contacts at a time in s."""
-        return total(self.find_contact_loads(seconds))
+        return compute_resultant(self.find_contact_loads(seconds))
 
     def _check(self, indenter: Indenter) -> None:
         """Raise ConfigError if an indenter's contact under its largest force is too wide.
@@ -292,7 +292,7 @@ class Load:
         path = self._paths[id(action)]
         position, velocity = self._to_metres(action.path[0]), np.zeros(3)
         if path:
-            position, velocity = path.at(progress)
+            position, velocity = path.interpolate(progress)
         normal = compute_surface_normal(self.poses, self._pitch, position)
         size = float(interpolate_knots(action.force, progress))
         if path and action.kind == "slide":
@@ -386,7 +386,7 @@ def compute_surface_normal(
     return np.asarray(poses.rotation[nearest, :, 2])
 
 
-def total(loads: Sequence[ContactLoad | Contact]) -> Resultant:
+def compute_resultant(loads: Sequence[ContactLoad | Contact]) -> Resultant:
     """Return the total force of some contacts, their centre of pressure and mean normal.
 
     Returns:
@@ -414,11 +414,11 @@ def remember(load: Fields) -> Callable[[int], StressField]:
     takes long.
     """
     period_us = math.inf if load.repeats is None else round(1e6 * load.repeats)
-    field_bytes = sum(part.nbytes for part in load.at(0.0))
+    field_bytes = sum(part.nbytes for part in load.compute_stress_field(0.0))
 
     @lru_cache(MAX_CACHED_BYTES // field_bytes)
     def at(time_us: float) -> StressField:
-        return load.at(time_us * 1e-6)
+        return load.compute_stress_field(time_us * 1e-6)
 
     return lambda time_us: at(time_us % period_us)
 

@@ -151,7 +151,7 @@ class HeavyPads:
             self._cubes.rotation,
         )
 
-    def stress(self, seconds: float) -> Array:
+    def compute_stress(self, seconds: float) -> Array:
         """Return the stress of the pads by weight and inertia (cubes, P), in Pa."""
         force = self.compute_specific_force(seconds)
         return np.asarray(force @ self._response.T)

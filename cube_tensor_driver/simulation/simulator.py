@@ -158,12 +158,12 @@ class Simulator:
 
         self._injector = Injector(self._links, faults)
         for number in range(instants):
-            stress, gradient = load.at(number * load.period / instants)
+            stress, gradient = load.compute_stress_field(number * load.period / instants)
             for link in self._links:
-                frequency = link.carried.frequency(stress, gradient, 0.0)
+                frequency = link.carried.compute_frequency(stress, gradient, 0.0)
                 link.prepared.append(frequency)
         for link in self._links:
-            link.line.send(link.hub.hello(), 0)
+            link.line.send(link.hub.make_hello(), 0)
 
     def _make_line(self, link: SkinLink) -> SimulatedLine:
         """Create the line of a hub to the host, a pseudo-terminal.
@@ -217,7 +217,7 @@ class Simulator:
                 report_us += REPORT_PERIOD_US
                 for link in self._links:
                     if link.line.plugged:
-                        frames = link.hub.hello() + link.hub.stats(now)
+                        frames = link.hub.make_hello() + link.hub.make_stats(now)
                         link.line.send(frames, now)
 
     def _is_needed(self) -> bool:
@@ -299,18 +299,18 @@ class Simulator:
             now_us: Present simulated time in µs; the sample may have been due earlier.
         """
         time_us = link.hub.next_us
-        load_us = link.load_us(time_us)
+        load_us = link.find_load_time_us(time_us)
         if link.prepared:
             instant = load_us // link.hub.period_us % len(link.prepared)
             frequency = link.prepared[instant]
         else:
             stress, gradient = self._field_at(load_us)
-            frequency = link.carried.frequency(
+            frequency = link.carried.compute_frequency(
                 stress,
                 gradient,
                 time_us * 1e-6,
             )
-        celsius = link.carried.cubes.temperature(time_us * 1e-6)
+        celsius = link.carried.cubes.compute_temperature(time_us * 1e-6)
         if not math.isnan(celsius):
             link.hub.celsius = round(100 * celsius)
         measured = self._injector.measure(link, frequency, time_us)

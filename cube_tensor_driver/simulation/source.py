@@ -153,7 +153,7 @@ class SimulatedSource:
         while (time_us := self.scans * self.period_us) < end_us:
             self.scans += 1
             stress, gradient = field_at(time_us)
-            yield pads.rows(stress, gradient, self.scans - 1, time_us)
+            yield pads.compute_rows(stress, gradient, self.scans - 1, time_us)
 
     def __enter__(self) -> SimulatedSource:
         return self
@@ -181,7 +181,7 @@ class SkinPads:
         self._cube = np.concatenate(cubes).astype(np.uint16)
         self._n_pads = max(hub.cubes.n_pads for hub in self._hubs)
 
-    def rows(
+    def compute_rows(
         self,
         stress: Array,
         gradient: Array,
@@ -210,13 +210,13 @@ class SkinPads:
             pads = hub.cubes
             rows = slice(start, start + len(cubes))
             # Frequencies from a real hub are also whole mHz.
-            millihertz = pads.frequency(
+            millihertz = pads.compute_frequency(
                 stress[cubes],
                 gradient[cubes],
                 seconds,
             )
             frequency[rows, : pads.n_pads] = to_hertz(millihertz)
-            temperature[rows] = pads.temperature(seconds)
+            temperature[rows] = pads.compute_temperature(seconds)
             if pads.heavy is not None:
                 forces.append(pads.heavy.compute_specific_force(seconds))
             start = rows.stop

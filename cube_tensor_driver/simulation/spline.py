@@ -66,7 +66,7 @@ class CubicSpline:
         control = np.linalg.solve(passed, knots)
         self._control = extend @ control
 
-    def at(self, time: float) -> tuple[Array, Array]:
+    def interpolate(self, time: float) -> tuple[Array, Array]:
         """Return the position (D,) at a time from 0 to 1, and its derivative (D,) by the time."""
         intervals = len(self._control) - 3
         i = min(int(time * intervals), intervals - 1)

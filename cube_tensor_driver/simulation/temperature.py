@@ -255,7 +255,7 @@ class ThermalPads:
         """Return what the hub's thermometer measures, the temperature of the ground, in °C."""
         return round(self._find_outside_temperatures(seconds)[0], 2)
 
-    def at(self, seconds: float) -> tuple[Array, Array]:
+    def compute_effect(self, seconds: float) -> tuple[Array, Array]:
         """Return the effect of temperature on the pads.
 
         Args:

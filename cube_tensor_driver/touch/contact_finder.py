@@ -86,7 +86,7 @@ class ContactSettings:
     poisson: float = 0.0
     influence: str = ""
 
-    def for_skin(self, stated: Elastomer | None) -> ContactSettings:
+    def adapt_to_skin(self, stated: Elastomer | None) -> ContactSettings:
         """Return these settings with the values of a skin file in place of `AUTO` and zeros.
 
         Args:
@@ -200,7 +200,7 @@ def make_contact_finder(
             functions belong to other cubes.
         ConfigError: The influence functions cannot be read.
     """
-    settings = settings.for_skin(elastomer)
+    settings = settings.adapt_to_skin(elastomer)
     if settings.method == INTERPOLATION:
         return _InterpolationFinder(settings, poses)
     return _InverseFinder(settings, poses, calibrations)
@@ -225,7 +225,7 @@ class _InterpolationFinder:
         touches: Touches = NO_TOUCHES,
         errors: Array | None = None,
     ) -> None:
-        self.contacts = self._surface.contacts(values, self._threshold)
+        self.contacts = self._surface.find_contacts(values, self._threshold)
 
     def follow(self, time_s: float, values: Array) -> bool:
         return False

@@ -58,7 +58,7 @@ class Interpolation:
         self._near = find_nearest_cubes(poses, NEIGHBOURS)
         self._weights: dict[tuple[int, ...], _Weights] = {}
 
-    def values(self, values: Array, columns: list[int]) -> Array:
+    def interpolate(self, values: Array, columns: list[int]) -> Array:
         """Interpolate one quantity to the M points of all patches.
 
         Args:
@@ -86,7 +86,7 @@ class Interpolation:
         result[is_unknown] = np.nan
         return result
 
-    def uncertainty(self, values: Array, columns: list[int]) -> Array:
+    def compute_uncertainty(self, values: Array, columns: list[int]) -> Array:
         """Compute the uncertainty of the result of `values`, with the same arguments.
 
         Returns:
@@ -138,7 +138,7 @@ class Interpolation:
 
         Returns:
             Weights (patches, points, neighbours x width) of the neighbours' values, and the
-            uncertainty (patches, points) as from `uncertainty`.
+            uncertainty (patches, points) as from `compute_uncertainty`.
         """
         near = self._near[chosen]
         n, n_near = near.shape
@@ -195,7 +195,7 @@ class _Weights:
         data: View (cubes, points, neighbours x width) of the entries of `matrix`.
         known: Whether each value and derivative (cubes, width) was known when the weights were
             computed.
-        uncertainty: Uncertainty (cubes, points) as from `Interpolation.uncertainty`.
+        uncertainty: Uncertainty (cubes, points) as from `Interpolation.compute_uncertainty`.
         empty: Whether no neighbour of a cube (cubes,) has a value.
     """
 

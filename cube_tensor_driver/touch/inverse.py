@@ -445,7 +445,7 @@ class SurfaceInverse:
         pad_variance = pad_variance.astype(np.float32)
 
         windows = self._windows
-        scale = windows.scale(y, pad_variance, known)
+        scale = windows.compute_scale(y, pad_variance, known)
         prior = windows.prior[windows.kind] + self._prediction.variance
         variance = scale[:, None] * prior
         variance += windows.compute_noise(pad_variance)

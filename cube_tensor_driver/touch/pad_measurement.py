@@ -285,7 +285,7 @@ def _compute_fourier_series(influence: Influence, r: Array) -> list[Array]:
     direction = np.stack([cosine, sine], axis=1)
     # The direction runs from the force to the cube, so the force lies at minus r.
     place = -r[:, None, None] * direction
-    responses = influence.at(place.reshape(-1, 2))
+    responses = influence.interpolate(place.reshape(-1, 2))
     responses = responses.reshape(-1, len(r), N_DIRECTIONS, 3)
 
     x, y, z = np.moveaxis(responses, -1, 0)

@@ -36,7 +36,7 @@ from ..core.poses import CubePoses
 from ..mechanics.cache import load_or_compute
 from ..mechanics.traction_prior import TractionPrior
 from .nearest_cubes import find_nearest_cubes
-from .prior import AMPLITUDE, covariance_matrix
+from .prior import AMPLITUDE, compute_covariance_matrix
 from .surface import make_square_points
 from .unrolled_skin import unroll
 
@@ -278,7 +278,7 @@ class WindowPosteriors:
             result[self._single] = products[:, :, 0]
         return result
 
-    def scale(
+    def compute_scale(
         self,
         y: Single,
         pad_variance: Single,
@@ -374,7 +374,7 @@ def _solve_window(
     known = model.known.ravel()
     pads = np.nan_to_num(model.by_pad)
 
-    unit_prior = covariance_matrix(
+    unit_prior = compute_covariance_matrix(
         traction_prior,
         columns,
         place,
@@ -476,9 +476,9 @@ def _compute_cross_covariance(
     angles = np.repeat(angle, n_points)
     variants = np.repeat(model.variant, n_points)
 
-    traction = traction_prior.cross(offset, angles, variants)
+    traction = traction_prior.compute_traction_covariance(offset, angles, variants)
     traction = traction[:, columns].reshape(n, n_points, width, 3)
-    pressure = traction_prior.pressure(offset, angles, variants)
+    pressure = traction_prior.compute_pressure_covariance(offset, angles, variants)
     pressure = pressure[:, columns].reshape(n, n_points, width)
     cross = np.empty((n_points, ROWS_PER_POINT, n, width))
     # The axes of `cross` are the points, their results, the cubes and the components.

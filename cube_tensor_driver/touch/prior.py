@@ -14,7 +14,7 @@ AMPLITUDE = 20e3
 value is the pressure of a firm touch."""
 
 
-def covariance_matrix(
+def compute_covariance_matrix(
     traction_prior: TractionPrior,
     columns: Index,
     place: Array,
@@ -37,7 +37,7 @@ def covariance_matrix(
     n = len(place)
     width = len(columns)
     first, second = np.triu_indices(n)
-    pairs = traction_prior.covariance(
+    pairs = traction_prior.compute_covariance(
         place[first] - place[second],
         angle[first],
         variant[first],

@@ -174,15 +174,15 @@ class Surface:
         """
         return Field(self._interpolate_pressure(values), self._interpolate_shear(values))
 
-    def uncertainty(self, values: Array) -> Array:
+    def compute_uncertainty(self, values: Array) -> Array:
         """Compute the standard deviation (M,) of the interpolated pressure at each point.
 
         It is divided by the standard deviation of the pressure over the skin: 0 at a cube with a
         value, 1 far from all cubes. Arguments as in `field`.
         """
-        return self._interpolation.uncertainty(values, self._pressure_columns)
+        return self._interpolation.compute_uncertainty(values, self._pressure_columns)
 
-    def contacts(self, values: Array, threshold: float) -> list[Contact]:
+    def find_contacts(self, values: Array, threshold: float) -> list[Contact]:
         """Find contacts: regions in which the pressure at the cubes' depth is above two thresholds.
 
         These are the absolute `threshold` and the fraction `RELATIVE_THRESHOLD` of the largest
@@ -223,9 +223,9 @@ class Surface:
 
         shear = np.nan_to_num(self._interpolate_shear(values))
         shear_by_patch = [self._arrange_by_patch(component) for component in shear.T]
-        moment_pressure = -self._interpolation.values(values, PRESSURE[:1])
+        moment_pressure = -self._interpolation.interpolate(values, PRESSURE[:1])
         moment_pressure = np.nan_to_num(moment_pressure)
-        uncertainty = self.uncertainty(values)
+        uncertainty = self.compute_uncertainty(values)
         is_shear_known = np.isfinite(values[:, SHEAR])
         loaded = _LoadedSurface(
             pressure=self._arrange_by_patch(pressure),
@@ -240,10 +240,10 @@ class Surface:
         return sorted(contacts, key=lambda contact: -contact.normal_force)
 
     def _interpolate_pressure(self, values: Array) -> Array:
-        return -self._interpolation.values(values, self._pressure_columns)
+        return -self._interpolation.interpolate(values, self._pressure_columns)
 
     def _interpolate_shear(self, values: Array) -> Array:
-        columns = [self._interpolation.values(values, [column]) for column in SHEAR]
+        columns = [self._interpolation.interpolate(values, [column]) for column in SHEAR]
         return np.stack(columns, axis=1)
 
     def _arrange_by_patch(self, on_points: Array) -> Array:
@@ -368,7 +368,7 @@ class _LoadedSurface(NamedTuple):
         moment_pressure: Pressure (cubes, points) in Pa, interpolated from values alone, as the
             shear is.
         uncertainty: Relative standard deviation (cubes, points) of the pressure, 0 to 1, as from
-            `Surface.uncertainty`.
+            `Surface.compute_uncertainty`.
         sees_shear: Whether some cube observes shear.
     """
 

@@ -137,7 +137,7 @@ def paint_squares(
     top: float,
     visible: Mask,
 ) -> list[Mesh]:
-    """Return one mesh for each colour of `step_colours`, with the squares of this colour.
+    """Return one mesh for each colour of `compute_step_colours`, with the squares of this colour.
 
     The squares show the field (values between the cubes) of a skin, and in a large skin also the
     cubes. With one mesh for each colour, a skin consists of few objects, and a computer without a
@@ -180,7 +180,7 @@ def find_colour_steps(
     return np.where(is_known, step.astype(int), COLOUR_STEPS)
 
 
-def step_colours(quantity: Quantity) -> NDArray[np.uint8]:
+def compute_step_colours(quantity: Quantity) -> NDArray[np.uint8]:
     """Return the colours of `paint_squares` (COLOUR_STEPS + 1, 3) in sRGB; the last is for NaN."""
     values = (np.arange(COLOUR_STEPS) + 0.5) / COLOUR_STEPS
     if quantity.signed:

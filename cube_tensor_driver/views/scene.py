@@ -97,7 +97,7 @@ class Quantity:
     of: Callable[[Array, Array], Array]
 
 
-def _component(name: str) -> Callable[[Array, Array], Array]:
+def _select_component(name: str) -> Callable[[Array, Array], Array]:
     column = COMPONENTS.index(name)
     return lambda values, residual: values[:, column]
 
@@ -121,7 +121,7 @@ def _make_magnitude(*names: str) -> Callable[[Array, Array], Array]:
     return of
 
 
-def _stress(
+def _make_stress_quantity(
     label: str,
     of: Callable[[Array, Array], Array],
     signed: bool = False,
@@ -137,8 +137,8 @@ def _stress(
 
 
 QUANTITIES = {
-    "pressure": _stress("pressure −σzz", lambda values, residual: -values[:, 2]),
-    "shear": _stress("shear |σzx, σyz|", _make_magnitude("zx", "yz")),
+    "pressure": _make_stress_quantity("pressure −σzz", lambda values, residual: -values[:, 2]),
+    "shear": _make_stress_quantity("shear |σzx, σyz|", _make_magnitude("zx", "yz")),
     "gradient": Quantity(
         "gradient |∂σzz/∂x, ∂σzz/∂y|",
         unit="kPa/mm",
@@ -148,9 +148,9 @@ QUANTITIES = {
         of=_make_magnitude("zz_x", "zz_y"),
     ),
     **{
-        name: _stress(
+        name: _make_stress_quantity(
             f"σ{name}",
-            _component(name),
+            _select_component(name),
             signed=True,
         )
         for name in STRESS

@@ -68,14 +68,14 @@ def run_emulated(options: argparse.Namespace) -> int:
     """Emulate a hub under a load until Ctrl-C."""
     from cube_tensor_driver.config.load_script import read_script
     from cube_tensor_driver.device.links.tcp import parse_url
-    from cube_tensor_driver.simulation.load import Load, default_script
+    from cube_tensor_driver.simulation.load import Load, read_default_script
 
     from ..captures import Oscillators
     from ..firmware import Emulator, build, need
 
     need("the emulated hub", "make", "arm-none-eabi-gcc", "qemu-system-arm")
     skin, hub = read_skin_of_hub(options.config)
-    script = default_script() if options.load is None else read_script(options.load)
+    script = read_default_script() if options.load is None else read_script(options.load)
     build(SOURCE, OUT, "an386")
     # The pads live in this process; the emulated hub measures them over a socket.
     pads = Oscillators(hub, Load(skin, script))

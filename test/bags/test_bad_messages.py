@@ -78,7 +78,7 @@ def damaged_copy(bag: Path, folder: Path, topic: str, damage, which: int, **opti
         for one in source.connections:
             writer.add_topic(one.topic, one.msgtype, one.qos)
         count = 0
-        for entry in source.entries():
+        for entry in source.read_entries():
             if entry.topic == topic:
                 if count == which:
                     writer.write(topic, entry.time_ns, damage(entry.data))
@@ -92,7 +92,7 @@ def stress_bytes(path: Path, folder: Path) -> list[bytes]:
     assert (result.messages, result.rows) == (MESSAGES, 16 * MESSAGES)
     assert result.skipped == (path.name == "bad")
     with Bag(folder) as made:
-        return [entry.data for entry in made.entries({"/stress"})]
+        return [entry.data for entry in made.read_entries({"/stress"})]
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_without_any_good_info_that_of_the_driver_counts(bag, tmp_path):
         for one in source.connections:
             writer.add_topic(one.topic, one.msgtype, one.qos)
         writer.add_topic("/driver/info", INFO)
-        for entry in source.entries():
+        for entry in source.read_entries():
             if entry.topic == "/info":
                 writer.write("/driver/info", entry.time_ns, entry.data)
                 entry = entry._replace(data=no_utf8(entry.data))
@@ -138,7 +138,7 @@ def test_a_bag_without_any_good_message_says_why(bag, tmp_path):
     with Bag(bag) as source, BagWriter(path) as writer:
         for one in source.connections:
             writer.add_topic(one.topic, one.msgtype, one.qos)
-        for entry in source.entries():
+        for entry in source.read_entries():
             damage = changed(FREQUENCIES, with_a_pad_less)
             is_bad = entry.topic == "/frequencies"
             writer.write(entry.topic, entry.time_ns, damage(entry.data) if is_bad else entry.data)
@@ -161,7 +161,7 @@ def test_one_bad_row_of_a_database_is_left_out(bag, tmp_path, caplog):
     database.close()
     reprocess(ReprocessJob(path, tmp_path / "one", "bag"))
     with Bag(tmp_path / "one") as made:
-        again = [entry.data for entry in made.entries({"/stress"})]
+        again = [entry.data for entry in made.read_entries({"/stress"})]
     assert again == stress_bytes(bag, tmp_path / "other")
     assert "3 damaged messages are left out" in caplog.text
 

@@ -55,7 +55,7 @@ def assert_same(one: list, other: list) -> None:
 
 
 def recorded_stress(source) -> list[StressRows]:
-    return [messages.rows for messages, _ in source.bag.stress("/stress")]
+    return [messages.rows for messages, _ in source.bag.read_stress("/stress")]
 
 
 def test_a_bag_is_a_source_of_its_rows(bag):
@@ -90,9 +90,9 @@ def test_the_recorded_stress_comes_again_whoever_iterates(bag):
         reconstructor = Reconstructor(source.skin)
         made, settings = [], None
         for rows in source:
-            if settings is not (settings := source.recording.settings_at(rows)):
+            if settings is not (settings := source.recording.find_settings(rows)):
                 reconstructor.rest_frequency = settings.rest_frequency
-            made.append(reconstructor.process(rows, source.recording.health.at(rows)))
+            made.append(reconstructor.process(rows, source.recording.health.find(rows)))
         assert_same(made, recorded)
     assert (np.concatenate([rows.status for rows in recorded]) & STUCK).any()
 
@@ -104,12 +104,12 @@ def test_message_by_message_too_and_again_after_a_jump_back(bag):
     with open_bag(bag) as source:
         recorded = [
             messages.rows.select(slice(k, k + 16))
-            for messages, _ in source.bag.stress("/stress")
+            for messages, _ in source.bag.read_stress("/stress")
             for k in range(0, len(messages.rows), 16)
         ]
         rows = [
             messages.rows.select(slice(k, k + 16))
-            for messages, _ in source.bag.frequencies("/frequencies")
+            for messages, _ in source.bag.read_frequencies("/frequencies")
             for k in range(0, len(messages.rows), 16)
         ]
     for k in [*range(MESSAGES), *range(80, 120), *range(0, 10), 150, 3]:
@@ -123,11 +123,11 @@ def test_health_goes_by_cube_and_stamp(bag):
         rows = next(iter(source))
         later = rows.select(rows.stamp_ns > START_NS + 1_200_000_000)
         some = rows.select(np.random.default_rng(1).permutation(len(rows))[:300])
-        health = source.recording.health.at(some)
+        health = source.recording.health.find(some)
         assert health.known.all()
         shifted = dataclasses.replace(some, stamp_ns=some.stamp_ns + 1)
-        assert not source.recording.health.at(shifted).known.any()
-        health = source.recording.health.at(later)
+        assert not source.recording.health.find(shifted).known.any()
+        health = source.recording.health.find(later)
         assert (health.left_out == np.where(later.cube == 3, 4, 0)).all()
         assert ((health.status & STUCK != 0) == (later.cube == 3)).all()
 
@@ -138,7 +138,7 @@ def test_health_of_rows_far_back_is_read_again(bag, monkeypatch):
     with open_bag(bag) as source:
         first, *_, last = source
         for rows in (first, last, first):
-            assert source.recording.health.at(rows).known.all()
+            assert source.recording.health.find(rows).known.all()
 
 
 def test_messages_whose_scans_would_join_come_one_by_one(tmp_path):

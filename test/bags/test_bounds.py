@@ -47,7 +47,7 @@ def write_mcap(
 
 def read_all(path: Path) -> int:
     with Bag(path) as bag:
-        return sum(1 for _ in bag.entries())
+        return sum(1 for _ in bag.read_entries())
 
 
 def a_large_chunk(folder: Path) -> Path:
@@ -135,16 +135,16 @@ def test_within_the_bounds_all_is_as_before(tmp_path: Path, name: str) -> None:
     messages = [os.urandom(1000) for _ in range(100)]
     path = write_mcap(tmp_path / "b.mcap", messages, chunk=10_000, compression=compression)
     with Bag(path) as bag:
-        assert [entry.data for entry in bag.entries()] == messages
+        assert [entry.data for entry in bag.read_entries()] == messages
     bare = write_mcap(tmp_path / "c.mcap", messages, compression=compression, index=IndexType.NONE)
     with Bag(bare) as bag:
-        assert [entry.data for entry in bag.entries()] == messages
+        assert [entry.data for entry in bag.read_entries()] == messages
 
 
 def test_bags_that_ros2_compressed_are_read(tmp_path: Path) -> None:
     """Whole files, or each message."""
     bag = a_folder(tmp_path)
-    (entry,) = Bag(bag).__enter__().entries()
+    (entry,) = Bag(bag).__enter__().read_entries()
     (name,) = packed(bag, "FILE")["relative_file_paths"]
     said = read_yaml(bag / "metadata.yaml")
     said["rosbag2_bagfile_information"]["relative_file_paths"] = [f"{name}.zstd"]
@@ -158,7 +158,7 @@ def test_bags_that_ros2_compressed_are_read(tmp_path: Path) -> None:
         writer.write("/text", 1, zstandard.compress(entry.data))
     packed(tmp_path / "m" / "bag", "MESSAGE")
     with Bag(tmp_path / "m" / "bag") as opened:
-        assert [one.data for one in opened.entries()] == [entry.data]
+        assert [one.data for one in opened.read_entries()] == [entry.data]
 
 
 @pytest.mark.parametrize("text", ["[7", "7", "[7]", "!!bool maybe"])
@@ -172,6 +172,6 @@ def test_damaged_quality_of_service_counts_as_none(tmp_path: Path, caplog, text:
         writer.add_message(writer.register_channel("/text", "cdr", schema, about), 1, b"x", 1)
         writer.finish()
     with Bag(path) as bag:
-        assert [entry.data for entry in bag.entries()] == [b"x"]
+        assert [entry.data for entry in bag.read_entries()] == [b"x"]
         assert not bag.connections[0].qos and not bag.connections[0].is_latched
     assert "/text: its quality of service profiles are damaged" in caplog.text

@@ -77,7 +77,7 @@ def stress(path: Path) -> dict[int, StressRows]:
     """The rows of each message by its stamp."""
     by_stamp = {}
     with Bag(path) as bag:
-        for messages, _ in bag.stress("/stress"):
+        for messages, _ in bag.read_stress("/stress"):
             n = len(messages.rows) // len(messages)
             for k, stamp_ns in enumerate(messages.stamp_ns.tolist()):
                 by_stamp[stamp_ns] = messages.rows.select(slice(k * n, (k + 1) * n))
@@ -142,7 +142,9 @@ def test_a_written_bag_is_read_by_rosbag2(tmp_path, options):
         INFO,
     }
     with Bag(path) as bag:
-        assert messages == [(entry.topic, entry.data, entry.time_ns) for entry in bag.entries()]
+        assert messages == [
+            (entry.topic, entry.data, entry.time_ns) for entry in bag.read_entries()
+        ]
         assert topics == {
             one.topic: (one.msgtype, make_typestore().hash_rihs01(one.msgtype))
             for one in bag.connections
@@ -215,7 +217,7 @@ def test_messages_come_in_the_order_in_which_rosbags_reads_them(tmp_path):
             for start, stop in ((None, None), (1105, None), (None, 1290), (1100, 1300)):
                 limits = {"start_ns": start, "stop_ns": stop}
                 given = {name: limit for name, limit in limits.items() if limit is not None}
-                entries = bag.entries({f"/{name}" for name in topics}, **given)
+                entries = bag.read_entries({f"/{name}" for name in topics}, **given)
                 ours = [(entry.topic, entry.time_ns, entry.data) for entry in entries]
                 assert ours == by_rosbags(topics, start=start, stop=stop) and len(ours) > 3
                 assert [time_ns for _, time_ns, _ in ours] == sorted(one[1] for one in ours)
@@ -416,7 +418,7 @@ def test_cut_off_anywhere_is_repaired(bag, tmp_path):
         for connection in source.connections:
             writer.add_topic(connection.topic, connection.msgtype)
         flushed = []
-        for number, entry in enumerate(source.entries(), 1):
+        for number, entry in enumerate(source.read_entries(), 1):
             writer.write(entry.topic, entry.time_ns, entry.data)
             if number % 60 == 0:
                 writer.flush()
@@ -432,10 +434,14 @@ def test_cut_off_anywhere_is_repaired(bag, tmp_path):
         complete = max(count for at, count in flushed if at <= size)
         assert done.messages == complete and done.damaged == 0
         with Bag(path) as read:
-            assert sum(1 for _ in read.entries()) == complete
+            assert sum(1 for _ in read.read_entries()) == complete
             # topic by topic by the index: entries counts them against what the bag says
             assert (
-                sum(1 for connection in read.connections for _ in read.entries({connection.topic}))
+                sum(
+                    1
+                    for connection in read.connections
+                    for _ in read.read_entries({connection.topic})
+                )
                 == complete
             )
         kept = size - done.cut
@@ -716,7 +722,7 @@ def test_info_shows_the_diagnostics_in_the_bag(bag, capsys, monkeypatch):
         SimpleNamespace(name="/left/driver: link hub0", message="", values=values),
         SimpleNamespace(name="/left/driver: rows", message="too slow", values=[]),
     ]
-    monkeypatch.setattr(summary, "last_diagnostics", lambda _: statuses)
+    monkeypatch.setattr(summary, "find_last_diagnostics", lambda _: statuses)
     assert main(["bag", "info", str(bag)]) == 0
     assert capsys.readouterr().out.splitlines()[-2:] == [
         "/left/driver: link hub0: nothing wrong; crc 3",
@@ -801,7 +807,7 @@ def test_a_killed_writer_leaves_what_was_flushed(tmp_path, storage):
     done = repair(path)
     assert done.messages >= 300 and done.damaged == 0
     with Bag(path) as bag:
-        times = [entry.time_ns for entry in bag.entries()]
+        times = [entry.time_ns for entry in bag.read_entries()]
     assert times == list(range(1000, 1000 + done.messages))
 
 
@@ -815,8 +821,8 @@ def test_disk_full_leaves_what_was_written(bag, tmp_path):
     kept = int(done.stdout.split()[-1])
     assert kept > 80
     with Bag(tmp_path / "full") as read, Bag(bag) as source:
-        whole = [entry.data for entry in source.entries()]
-        assert [entry.data for entry in read.entries()] == whole[:kept]
+        whole = [entry.data for entry in source.read_entries()]
+        assert [entry.data for entry in read.read_entries()] == whole[:kept]
 
 
 @pytest.mark.parametrize(
@@ -840,7 +846,7 @@ def test_files_are_read_in_the_order_of_recording(tmp_path, name, listed):
         write_yaml(bag / "metadata.yaml", {"rosbag2_bagfile_information": about})
     repair(bag)
     with Bag(bag) as read:
-        order = [int(entry.data) for entry in read.entries()]
+        order = [int(entry.data) for entry in read.read_entries()]
     assert order == [*listed, *(number for number in range(12) if number not in listed)]
 
 

@@ -110,11 +110,11 @@ def frequency_stamps(bag: Path, copy: Path | None = None) -> list[int]:
             return []
         bag = copy
     with Bag(bag) as opened:
-        if "/frequencies" not in opened.topics(FREQUENCIES):
+        if "/frequencies" not in opened.list_topics(FREQUENCIES):
             return []
         return [
             int(stamp)
-            for messages, _ in opened.frequencies("/frequencies")
+            for messages, _ in opened.read_frequencies("/frequencies")
             for stamp in messages.stamp_ns
         ]
 
@@ -173,7 +173,7 @@ def test_recorded_is_published_and_reprocessed_is_live(running, tmp_path):
         assert all(cube.uid for cube in bag.read_infos("/info")[-1].cubes)
         recorded = [
             int(stamp)
-            for messages, _ in bag.frequencies("/frequencies")
+            for messages, _ in bag.read_frequencies("/frequencies")
             for stamp in messages.stamp_ns
         ]
         latched = {one.topic for one in bag.connections if one.is_latched}
@@ -297,7 +297,7 @@ class Publishers:
 
 def recorded(path: Path) -> list[tuple[str, bytes]]:
     with Bag(path) as bag:
-        return [(entry.topic, entry.data) for entry in bag.entries()]
+        return [(entry.topic, entry.data) for entry in bag.read_entries()]
 
 
 def test_recording_begins_when_all_topics_are_connected(tmp_path, monkeypatch):

@@ -193,7 +193,7 @@ def test_saved_tables_and_pictures_hold_what_the_cubes_showed() -> None:
         ["-0.5", "-3000", "2e+06", "1.25"],
         ["0", "-4000", "2e+06", "1.25"],
     ]
-    panels = [("normal stress / kPa", {"c1": history.of(1, zz) / 1e3})]
+    panels = [("normal stress / kPa", {"c1": history.select(1, zz) / 1e3})]
     (axis,) = (figure := draw_panels(history.times, "time before now / s", panels)).axes
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("time before now / s", "normal stress / kPa")
     np.testing.assert_allclose(axis.lines[0].get_xydata(), [[-1, -2], [-0.5, -3], [0, -4]])

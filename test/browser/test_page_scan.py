@@ -25,7 +25,7 @@ from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.rows import StressRows
 from cube_tensor_driver.messages.contacts import decode_traction, make_traction_message
 from cube_tensor_driver.ros.messages import make_message
-from cube_tensor_driver.simulation.load import Load, default_script
+from cube_tensor_driver.simulation.load import Load, read_default_script
 from cube_tensor_driver.touch.inverse import SurfaceInverse
 from cube_tensor_driver.touch.surface import Surface, place_patches
 
@@ -65,9 +65,11 @@ def test_a_point_cloud_becomes_the_field_between_its_points(poses):
 
 def test_without_the_node_the_field_is_the_pressure_on_the_surface():
     """The pressure is that of the inverse, and its integral is the force of the load."""
-    load = Load(DEMO, default_script())
-    seconds = max(np.arange(0, load.period, 0.05), key=lambda time: -load.total(time)[0][2])
-    stress, gradient = load.at(seconds)
+    load = Load(DEMO, read_default_script())
+    seconds = max(
+        np.arange(0, load.period, 0.05), key=lambda time: -load.compute_resultant(time)[0][2]
+    )
+    stress, gradient = load.compute_stress_field(seconds)
     values = np.concatenate([stress, gradient[:, :3].reshape(-1, 9)], axis=1)
     values[:, ["y" in name for name in COMPONENTS]] = np.nan  # Planar cubes do not observe y.
     surface = Surface(DEMO.poses, load.depth, 12)
@@ -76,7 +78,7 @@ def test_without_the_node_the_field_is_the_pressure_on_the_surface():
     field = model.compute(values, None)
     force = field.pressure.sum() * surface.area
     # The cubes are 12 mm apart, and the contact is 5 mm wide.
-    assert force == pytest.approx(-load.total(seconds)[0][2], rel=0.25)
+    assert force == pytest.approx(-load.compute_resultant(seconds)[0][2], rel=0.25)
     pressure = SurfaceInverse(DEMO, depth=load.depth).field(values).pressure
     assert field.pressure.max() == pytest.approx(pressure.max(), rel=0.02)
     assert surface.field(values).pressure.max() < 0.95 * pressure.max()
@@ -161,7 +163,7 @@ def test_the_deviation_is_a_colour_while_the_node_says_it(poses, known):
     values = np.full((16, 15), 5.0)
     none = np.zeros(16, int)
     scan = Scan(values, np.zeros(16), none, none, np.zeros(16), field, [])
-    colouring = Colouring.of(scan, surface, DEVIATION, 0.0, 0.0)
+    colouring = Colouring.from_scan(scan, surface, DEVIATION, 0.0, 0.0)
     if not known:
         assert np.isnan(colouring.field).all() and np.isnan(colouring.cubes).all()
         assert colouring.above is None

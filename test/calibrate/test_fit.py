@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from cube_tensor_driver.calibrate.fit import (
+    compute_measured_stress,
     describe_mode,
     fit,
     loads_from_forces,
-    measured_stress,
 )
 from cube_tensor_driver.core.calibration import Calibration, make_illustrative_calibration
 from cube_tensor_driver.core.errors import FitError
@@ -171,12 +171,12 @@ def test_readings_from_frequencies():
     )
     v = np.random.default_rng(0).normal(size=(5, 8)) * 1e3
     f = compute_pad_frequency(v, c.rest_frequency * 1.001, c.beta, c.modulus)
-    np.testing.assert_allclose(measured_stress(c, f, np.full(5, 35.0)), v, atol=1e-6)
+    np.testing.assert_allclose(compute_measured_stress(c, f, np.full(5, 35.0)), v, atol=1e-6)
     f[2, 3] = 1e9
     with pytest.raises(FitError, match=r"load 3, pad -z\+x: 1e\+09 Hz"):
-        measured_stress(c, f)
+        compute_measured_stress(c, f)
     with pytest.raises(FitError, match=r"\(5, 4\).*8"):
-        measured_stress(c, f[:, :4])
+        compute_measured_stress(c, f[:, :4])
 
 
 def test_loads_from_a_reference_force_sensor():

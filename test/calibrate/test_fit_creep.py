@@ -20,10 +20,10 @@ from bag_maker import START_NS, info_of
 from dummy_pad import with_dummy
 
 from conftest import encoded
-from cube_tensor_driver.bags.metadata import make_typestore, quality
+from cube_tensor_driver.bags.metadata import describe_quality, make_typestore
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.calibrate.creep import CreepFit, add_creep, compute_step_reading, fit_creep
-from cube_tensor_driver.calibrate.fit import measured_stress
+from cube_tensor_driver.calibrate.fit import compute_measured_stress
 from cube_tensor_driver.cli import main as cli
 from cube_tensor_driver.config.calibration import read_calibration
 from cube_tensor_driver.core.calibration import make_illustrative_calibration
@@ -47,7 +47,8 @@ def measured(time, scale, growth, exponent=0.2, seed=0, base=PLAIN):
     cubes = SimulatedCubes([base], PadErrors(None, imperfections=creep), seed=seed)
     gradient = np.zeros((1, 6, 3))
     found = [
-        cubes.frequency(PRESS[None] * s, gradient, t) for t, s in zip(time, scale, strict=True)
+        cubes.compute_frequency(PRESS[None] * s, gradient, t)
+        for t, s in zip(time, scale, strict=True)
     ]
     return np.concatenate(found) * 1e-3
 
@@ -62,7 +63,9 @@ def fitted(growth, exponent=0.2, seed=0) -> CreepFit:
     """The law from one recording of 10 min at 20 Hz: 10 s of rest, 9 min of load, recovery."""
     time = np.arange(0, 595, 0.05)
     frequency = measured(time, pressed(time, 10, 550), growth, exponent, seed)
-    return fit_creep(time, measured_stress(PLAIN, frequency), PLAIN.noise, PLAIN.layout.pads)
+    return fit_creep(
+        time, compute_measured_stress(PLAIN, frequency), PLAIN.noise, PLAIN.layout.pads
+    )
 
 
 def held_times(hold):

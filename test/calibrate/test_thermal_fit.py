@@ -15,7 +15,7 @@ pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 from bag_maker import START_NS, info_of
 
 from conftest import encoded
-from cube_tensor_driver.bags.metadata import make_typestore, quality
+from cube_tensor_driver.bags.metadata import describe_quality, make_typestore
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.calibrate.thermal import Warming, fit_thermal
 from cube_tensor_driver.cli import main as cli
@@ -55,13 +55,13 @@ def play(cubes: SimulatedCubes, seconds: np.ndarray, load: np.ndarray):
     """Rows of one scan after the other."""
     stress, gradient = np.tile(load, (N_CUBES, 1)), np.zeros((N_CUBES, 6, 3))
     for number, time in enumerate(seconds.tolist()):
-        hertz = cubes.frequency(stress, gradient, time) * 1e-3
+        hertz = cubes.compute_frequency(stress, gradient, time) * 1e-3
         yield FrequencyRows.from_values(
             np.arange(N_CUBES, dtype=np.uint16),
             hertz.astype(np.float32),
             stamp_ns=START_NS + round(time * 1e9),
             sequence=number,
-            temperature=cubes.temperature(time),
+            temperature=cubes.compute_temperature(time),
         )
 
 
@@ -172,7 +172,7 @@ def test_a_fast_ramp_is_no_contact_and_hides_none(fitted, tared):
     finder, blind, informed = finders
     centre, flat = np.array([4e-3, 2e-3]), np.zeros(9, np.intp)
     offset = poses.position[:, :2] - centre
-    by_force = finder._inverse.contact_response.response(offset, flat, flat, 2e-3)[:, :, 2]
+    by_force = finder._inverse.contact_response.compute_response(offset, flat, flat, 2e-3)[:, :, 2]
     pressed = -by_force / np.where(np.arange(15) < 6, 1.0, 2e-3)  # 1 N, Pa and Pa/m
     reconstruct, times = Reconstructor(calibrations), np.arange(0.0, 260.0, 2.0)
     if tared:

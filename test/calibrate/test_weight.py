@@ -15,7 +15,7 @@ pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 from bag_maker import START_NS, header, info_of, message
 
 from conftest import encoded
-from cube_tensor_driver.bags.metadata import make_typestore, quality
+from cube_tensor_driver.bags.metadata import describe_quality, make_typestore
 from cube_tensor_driver.bags.reprocess.job import Overrides, choose_settings
 from cube_tensor_driver.bags.source import open_bag
 from cube_tensor_driver.bags.write import BagWriter
@@ -95,7 +95,7 @@ def write_bag(folder, skin, scans, motion=True):
         topics["compensation"] = COMPENSATION_TYPE
     with BagWriter(folder) as writer:
         for topic, kind in topics.items():
-            writer.add_topic(f"/{topic}", kind, [quality(latched=topic == "info")])
+            writer.add_topic(f"/{topic}", kind, [describe_quality(latched=topic == "info")])
         info = info_of(skin, Pipeline([cube.calibration for cube in skin.cubes]), START_NS)
         writer.write("/info", START_NS, bytes(store.serialize_cdr(info, INFO)))
         for rows in scans:
@@ -190,7 +190,7 @@ class Pressed:
         self.stress = np.zeros((cubes, 6))
         self.stress[:, 2] = zz
 
-    def at(self, seconds: float):
+    def compute_effect(self, seconds: float):
         return self.stress, np.zeros((len(self.stress), 6, 3))
 
 

@@ -33,7 +33,7 @@ from cube_tensor_driver.core.status import (
     STUCK,
 )
 from cube_tensor_driver.simulation.cubes import SimulatedCubes
-from cube_tensor_driver.simulation.load import Load, default_script
+from cube_tensor_driver.simulation.load import Load, read_default_script
 
 PERIOD_NS = 10_000_000  # 100 Hz
 CALIBRATION = make_illustrative_calibration("planar")
@@ -124,10 +124,13 @@ def test_a_load_that_moves_while_hubs_stall_is_no_noise():
     the demo's load at four times its speed."""
     skin = read_skin(find_package_data() / "config" / "skin_demo.yaml")
     load, cubes = (
-        Load(skin, default_script()),
+        Load(skin, read_default_script()),
         SimulatedCubes([cube.calibration for cube in skin.cubes]),
     )
-    table = [cubes.frequency(*load.at(k * load.period / 1000), 0.0) * 1e-3 for k in range(1000)]
+    table = [
+        cubes.compute_frequency(*load.compute_stress_field(k * load.period / 1000), 0.0) * 1e-3
+        for k in range(1000)
+    ]
     health = Health(Pipeline([cube.calibration for cube in skin.cubes], np.float32))
     cube, random, begin = np.arange(16, dtype=np.uint16), np.random.default_rng(1), 0
     while begin < 60_000:

@@ -76,7 +76,7 @@ class RandomHub:
                 self._send(self._sample())
             if now_us // 200_000 > second:
                 second = now_us // 200_000
-                self._send(self.hub.hello() + self.hub.stats(now_us))
+                self._send(self.hub.make_hello() + self.hub.make_stats(now_us))
 
     def _sample(self) -> bytes:
         shape = len(self.hub.cube_uids), N_PADS

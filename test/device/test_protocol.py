@@ -27,8 +27,8 @@ from cube_tensor_driver.device.wire.protocol import (
     Sample,
     Stats,
     Time,
+    count_sample_bytes,
     encode,
-    sample_bytes,
 )
 from cube_tensor_driver.simulation.hub import SimulatedHub
 
@@ -123,7 +123,7 @@ def test_bytes_of_a_sample_are_known_beforehand(n_cubes: int, n_pads: int) -> No
         np.full(n_cubes, 0x01010101, "<u4"),
         np.full(n_cubes, 0x0101, "<i2"),
     )
-    assert abs(len(encode(full)) - sample_bytes(n_cubes, n_pads)) <= 1
+    assert abs(len(encode(full)) - count_sample_bytes(n_cubes, n_pads)) <= 1
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -457,7 +457,7 @@ def test_a_simulated_hub_keeps_the_rules_of_the_page():
     # R6: the sample of 2000 has not been taken yet, and START must not leave it out.
     assert answers(hub, 2, now_us=2500) == [Ack(2)]
     assert (hub.next_us, hub.sequence) == (2000, 1)
-    (stats,) = Decoder().feed(hub.stats(2500))
+    (stats,) = Decoder().feed(hub.make_stats(2500))
     assert stats.taken == hub.sequence  # S7
     assert answers(hub, 4, 50) == [Ack(4, 2, 1000)]  # R4
     assert answers(hub, 4, 500, now_us=2500) == [Ack(4, 0, 500)]  # R3, R7

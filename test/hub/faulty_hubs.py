@@ -265,10 +265,10 @@ class StopsAtClosing(HubInMemory):
 
 @faulty("R8: starts by itself after power-up")
 class StartsByItself(HubInMemory):
-    def hello(self):
+    def make_hello(self):
         if not self.sequence:
             self.started = True
-        return super().hello()
+        return super().make_hello()
 
 
 # Device time.
@@ -464,7 +464,7 @@ sends("F4: HELLO with flags", of(Hello, lambda hub, one: [replace(one, flags=4)]
 
 
 def hello_first(hub, ask, now, right):
-    return hub.hello() + encode(Ack(1)) if ask.request == Command.HELLO else right
+    return hub.make_hello() + encode(Ack(1)) if ask.request == Command.HELLO else right
 
 
 answers("H1: HELLO before its ACK", hello_first)
@@ -489,19 +489,19 @@ class Seconds(HubInMemory):
 @faulty("H1: HELLO every two seconds")
 class SlowHello(Seconds):
     def at(self, now_us):
-        return (self.hello() if self.n % 2 else b"") + self.stats(now_us)
+        return (self.make_hello() if self.n % 2 else b"") + self.make_stats(now_us)
 
 
 @faulty("H1: HELLO twice a second")
 class FastHello(Seconds):
     def at(self, now_us):
-        return 2 * self.hello() + self.stats(now_us)
+        return 2 * self.make_hello() + self.make_stats(now_us)
 
 
 @faulty("H1: no HELLO while started")
 class HelloStopped(Seconds):
     def at(self, now_us):
-        return (b"" if self.started else self.hello()) + self.stats(now_us)
+        return (b"" if self.started else self.make_hello()) + self.make_stats(now_us)
 
 
 @faulty("H1: no HELLO after power-up")
@@ -517,13 +517,13 @@ class NoFirstHello(HubInMemory):
 @faulty("L5 S8: STATS every two seconds")
 class SlowStats(Seconds):
     def at(self, now_us):
-        return self.hello() + (self.stats(now_us) if self.n % 2 else b"")
+        return self.make_hello() + (self.make_stats(now_us) if self.n % 2 else b"")
 
 
 @faulty("S8: no STATS while stopped")
 class StatsStarted(Seconds):
     def at(self, now_us):
-        return self.hello() + (self.stats(now_us) if self.started else b"")
+        return self.make_hello() + (self.make_stats(now_us) if self.started else b"")
 
 
 # STATS.
@@ -555,8 +555,8 @@ sends(
 
 @faulty("S4: dropped is cleared by each STATS")
 class ClearsDropped(HubInMemory):
-    def stats(self, now_us):
-        frame = super().stats(now_us)
+    def make_stats(self, now_us):
+        frame = super().make_stats(now_us)
         self.dropped = 0
         return frame
 
@@ -570,8 +570,8 @@ class TakenFromStart(HubInMemory):
             self.since = self.sequence
         return super().receive(data, now_us)
 
-    def stats(self, now_us):
-        (one,) = Decoder().feed(super().stats(now_us))
+    def make_stats(self, now_us):
+        (one,) = Decoder().feed(super().make_stats(now_us))
         return encode(replace(one, taken=one.taken - self.since))
 
 
@@ -641,8 +641,8 @@ class StartsAnew(HubInMemory):
 class LatePeriod(HubInMemory):
     asked_us = 10_000
 
-    def hello(self):
-        (one,) = Decoder().feed(super().hello())
+    def make_hello(self):
+        (one,) = Decoder().feed(super().make_hello())
         return encode(replace(one, period_us=self.asked_us))
 
     def _answer(self, request, now_us):

@@ -34,7 +34,7 @@ from cube_tensor_driver.device.wire.protocol import Command, Request, Sample, Ti
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import list_skin_processes
 from cube_tensor_driver.simulation.cubes import compute_skin_components, make_hub_cubes
-from cube_tensor_driver.simulation.load import Load, default_script
+from cube_tensor_driver.simulation.load import Load, read_default_script
 from cube_tensor_hub.captures import COUNTER_HZ, WINDOW_US, Oscillators, find_edges
 from cube_tensor_hub.check import Checked, check
 from cube_tensor_hub.firmware import Emulator, FirmwareError, build, find_missing, need
@@ -172,7 +172,7 @@ def simulated_hub(folder: Path) -> Iterator[str]:
 def emulated_hub(image: Path, skin: Skin) -> Iterator[tuple[str, Oscillators]]:
     """The port of an emulated hub, and its pads under a load."""
     (hub,) = make_hub_cubes(skin)
-    pads = Oscillators(hub, Load(skin, default_script()))
+    pads = Oscillators(hub, Load(skin, read_default_script()))
     with Emulator(image) as emulator:
         server = threading.Thread(target=pads.serve, args=(emulator.pads,))
         server.start()
@@ -289,11 +289,11 @@ def test_the_load_on_the_pads_comes_out_as_tensors(out, ros, tmp_path):
         ros.wait(lambda: len(messages) > 100)
         children.check()
     rows = concatenate([decoded(message).rows for message in messages])
-    load, bound = Load(skin, default_script()), resolution(skin)
+    load, bound = Load(skin, read_default_script()), resolution(skin)
     middles = np.array(pads.windows)[rows.sequence]
     truth = np.array(
         [
-            compute_skin_components(skin, *load.at(1e-6 * middle))[cube]
+            compute_skin_components(skin, *load.compute_stress_field(1e-6 * middle))[cube]
             for middle, cube in zip(middles.tolist(), rows.cube.tolist(), strict=True)
         ]
     )

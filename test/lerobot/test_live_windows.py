@@ -222,7 +222,7 @@ def test_the_official_recorder_finds_the_camera_and_loses_no_sample(tmp_path):
     assert numbers == said["numbers given"] and len(numbers) > 30
 
     recorded = RecordedWindows(tmp_path / "touch")
-    windows = [recorded.at(number) for number in numbers]
+    windows = [recorded.find_frame(number) for number in numbers]
     sequence = [[] for _ in range(8)]
     late_ns = []
     for k, window in enumerate(windows):

@@ -39,13 +39,13 @@ def test_slopes_are_differences_of_the_response(responses):
     )
 
     def under_force(place: np.ndarray, size: float = size) -> np.ndarray:
-        return responses.response(place, angle, variant, size) @ FORCE
+        return responses.compute_response(place, angle, variant, size) @ FORCE
 
     def assert_close(found: np.ndarray, expected: np.ndarray, tolerance: float) -> None:
         largest = np.abs(expected).max()
         np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance * largest)
 
-    unit = responses.response(place, angle, variant, size).swapaxes(1, 2)
+    unit = responses.compute_response(place, angle, variant, size).swapaxes(1, 2)
     assert_close(slopes[:, :3], unit, 1e-6)
     for axis in range(2):
         shift = step * np.eye(2)[axis]
@@ -73,7 +73,7 @@ def test_a_moment_is_a_pair_of_forces(responses):
     for sign in (1, -1):
         for axis, across, turn in ((0, 1, 1), (1, 0, -1)):
             centre = sign * h * np.eye(2)[axis]
-            unit = responses.response(place - centre, angle, variant, size)
+            unit = responses.compute_response(place - centre, angle, variant, size)
             moment = moment + sign * turn * unit[:, :, across] / (4 * h)
     np.testing.assert_allclose(slopes[:, 7], moment, rtol=0, atol=2e-5 * np.abs(moment).max())
 
@@ -91,7 +91,7 @@ def test_distant_contacts_cause_stress_beyond_the_tables():
             np.array([[*place, -DEPTH]]), np.zeros((1, 3)), FORCE[None], 0.48
         )
         size, variant = 0.7 * DEPTH, np.zeros(1, np.intp)
-        cubic = half_space.response(place[None], np.zeros(1), variant, size) @ FORCE
+        cubic = half_space.compute_response(place[None], np.zeros(1), variant, size) @ FORCE
         linear = half_space.compute_response_to_forces(
             place[None], np.zeros(1), variant, np.array([size]), FORCE[None]
         )

@@ -89,8 +89,8 @@ def test_pressure_everywhere_is_the_calibration_s_response_to_it():
 
 def test_influence_converges_with_the_mesh(influence):
     x = np.linspace(-10e-3, 10e-3, 41)
-    coarse = influence.at(x[:, None])
-    fine = compute_influence(LAYER, PLANAR, 1).at(x[:, None])
+    coarse = influence.interpolate(x[:, None])
+    fine = compute_influence(LAYER, PLANAR, 1).interpolate(x[:, None])
     assert np.abs(coarse - fine).max() < 0.02 * np.abs(fine).max()
 
 
@@ -98,7 +98,7 @@ def test_without_a_cube_the_layer_carries_the_pressure():
     soft = replace(LAYER, cube_young=LAYER.young, cube_poisson=LAYER.poisson)
     influence = compute_influence(soft, PLANAR, 0)
     x = np.linspace(-20e-3, 20e-3, 2001)
-    upper = influence.at(x[:, None])[:2, :, 1]
+    upper = influence.interpolate(x[:, None])[:2, :, 1]
     assert np.trapezoid(upper, x, axis=1) == pytest.approx(1.0, rel=0.03)
 
 

@@ -39,7 +39,7 @@ def test_hertz_contact_on_a_half_space_is_that_of_point_forces(half_space, size,
     random = np.random.default_rng(1)
     place, angle = random.uniform(-0.02, 0.02, (30, 2)), random.uniform(-3, 3, 30)
     below = np.column_stack([place, np.full(30, -DEPTH)])
-    seen = ContactResponse(half_space).response(place, angle, POINTS[:30], size)
+    seen = ContactResponse(half_space).compute_response(place, angle, POINTS[:30], size)
     for axis in range(3):
         stress, gradient = contact.field(
             below, *contact.hertz(size, np.eye(3)[axis], order=20), 0.3
@@ -53,7 +53,7 @@ def test_a_layer_presses_on_its_ground_with_the_whole_force():
     """The mean of sigma_zz over a plane is that of the traction, at every depth (equilibrium)."""
     layer = Layer(11e-3, 0.48)
     for depth in (1e-3, 5e-3, 10.9e-3):
-        transfer = layer.transfer(np.array([1e-3, 0.0]), np.zeros(2), depth)
+        transfer = layer.compute_transfer(np.array([1e-3, 0.0]), np.zeros(2), depth)
         assert transfer[:, FIELD.index("zz"), 2] == pytest.approx([1, 1], abs=1e-8)
         assert transfer[:, FIELD.index("zx"), 0] == pytest.approx([1, 1], abs=1e-8)
     side = transfer[:, FIELD.index("xx"), 2]  # confined: nu / (1 - nu)
@@ -65,13 +65,13 @@ def test_a_layer_is_in_equilibrium_and_sticks_to_its_ground():
     random = np.random.default_rng(2)
     kx, ky = random.normal(size=(2, 50)) * 400
     layer = Layer(8e-3, 0.45)
-    field = layer.transfer(kx, ky, 3e-3)
+    field = layer.compute_transfer(kx, ky, 3e-3)
     for row in ("x", "y", "z"):
         pairs = [("".join(sorted(row + other)), other) for other in "xyz"]
         names = [{"xz": "zx"}.get(pair, pair) + f"_{axis}" for pair, axis in pairs]
         total = sum(field[:, FIELD.index(name)] for name in names)
         assert np.abs(total).max() < 1e-10 * np.abs(field).max()
-    xx, yy, zz = (layer.transfer(kx, ky, 8e-3 - 1e-12)[:, k] for k in range(3))
+    xx, yy, zz = (layer.compute_transfer(kx, ky, 8e-3 - 1e-12)[:, k] for k in range(3))
     strain = xx - 0.45 * (yy + zz)
     assert np.abs(strain).max() < 1e-8 * np.abs(xx).max()
 
@@ -85,7 +85,7 @@ def test_covariances_of_the_prior_are_sums_over_its_waves(half_space):
     lengths = np.array(PRIOR_LENGTHS)
     prior = np.mean([2 * np.pi * l**2 * np.exp(-square * l**2 / 2) for l in lengths], axis=0)
     prior *= DEPTH**2 * (line[1] - line[0]) ** 2 / (2 * np.pi) ** 2
-    transfer = half_space.layer.transfer(kx, ky, DEPTH)
+    transfer = half_space.layer.compute_transfer(kx, ky, DEPTH)
     shift = np.exp(1j * (np.stack([kx, ky], axis=1) @ (place[0] - place[1])))
     weighted = transfer * (prior * shift)[:, None, None] * [SHEAR_RATIO**2, SHEAR_RATIO**2, 1.0]
     matrix = np.einsum("nai,nbi->ab", weighted, transfer.conj(), optimize=True).real
@@ -94,7 +94,7 @@ def test_covariances_of_the_prior_are_sums_over_its_waves(half_space):
         unit = np.eye(24)
         views.append(in_cube_frames(unit[:, :6], unit[:, 6:].reshape(-1, 6, 3), np.full(24, one)).T)
     expected = views[0] @ matrix @ views[1].T
-    found = TractionPrior(half_space).covariance(
+    found = TractionPrior(half_space).compute_covariance(
         place[:1] - place[1:], angle[:1], POINTS[:1], angle[1:], POINTS[:1]
     )[0]
     assert np.abs(found - expected).max() < 2e-3 * np.abs(expected).max()
@@ -105,7 +105,7 @@ def test_covariances_of_the_prior_are_sums_over_its_waves(half_space):
     [
         (lambda: Layer(0.0), "thickness is 0.0"),
         (lambda: Layer(1e-2, 0.6), "0.6"),
-        (lambda: Layer(3e-3).transfer(np.ones(1), np.ones(1), 4e-3), "between 0 and"),
+        (lambda: Layer(3e-3).compute_transfer(np.ones(1), np.ones(1), 4e-3), "between 0 and"),
     ],
 )
 def test_what_no_layer_is(make, words):

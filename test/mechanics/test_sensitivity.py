@@ -42,7 +42,7 @@ def changes_at(place, layer) -> np.ndarray:
     n = len(place)
     responses = ContactResponse(CubeMeasurement(layer, DEPTH, HALF_SIDE))
     turned, size = np.full(n, 0.5), np.full(n, RADIUS)
-    return responses.sensitivity(place, turned, size, np.tile(FORCE, (n, 1))).swapaxes(0, 1)
+    return responses.compute_sensitivity(place, turned, size, np.tile(FORCE, (n, 1))).swapaxes(0, 1)
 
 
 def below_a_ball(place, depth, poisson) -> np.ndarray:

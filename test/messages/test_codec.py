@@ -116,16 +116,16 @@ def test_several_messages_are_decoded_and_encoded_together(kind):
 
 
 def test_a_buffer_is_filled_again_and_again():
-    buffer = stress_codec.buffer(b"skin\0", 4)
+    buffer = stress_codec.make_buffer(b"skin\0", 4)
     for n in (4, 4):
         rows = rows_of(STRESS, n)
         for name in stress_codec.columns:
             getattr(buffer.rows, name)[:] = getattr(rows, name)
-        assert_equal(stress_codec.decode(buffer.data()).rows, rows)
+        assert_equal(stress_codec.decode(buffer.encode()).rows, rows)
     # written in place, stamped with its earliest row
     buffer.rows.status[:] = 3
     buffer.rows.stamp_ns[:] = STAMP_NS + np.array([5, 4, 9, 7])
-    read = stress_codec.decode(buffer.data())
+    read = stress_codec.decode(buffer.encode())
     assert read.rows.status.tolist() == [3] * 4 and read.stamp_ns.tolist() == [STAMP_NS + 4]
 
 

@@ -120,7 +120,7 @@ def write_bag(folder: Path, recorded: dict[str, list[bytes]]) -> Path:
 
 def messages(bag: Path, topic: str) -> list[bytes]:
     with Bag(bag) as opened:
-        return [entry.data for entry in opened.entries({topic})]
+        return [entry.data for entry in opened.read_entries({topic})]
 
 
 def numbers(value: object) -> list[float]:
@@ -173,7 +173,7 @@ def test_pads_in_a_thin_layer_out_of_a_bag(tmp_path, one_process):
     sources, forces = contact.hertz(3e-3, FORCE, centre, order=8)
     which = [LAYOUTS["cube"].pads.index(pad) for pad in calibration.layout.pads]
     pads = [
-        np.einsum("psi,si->p", influence.at(sources[:, :2] - cube.xyz[:2])[which], forces)
+        np.einsum("psi,si->p", influence.interpolate(sources[:, :2] - cube.xyz[:2])[which], forces)
         for cube in skin.cubes
     ]
     law = calibration.rest_frequency, calibration.beta, calibration.modulus

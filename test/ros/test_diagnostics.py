@@ -25,7 +25,7 @@ from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import UInt32
 
 from cube_tensor_driver.bags.read import Bag
-from cube_tensor_driver.bags.summary import last_diagnostics
+from cube_tensor_driver.bags.summary import find_last_diagnostics
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.browser import markup
 from cube_tensor_driver.config.package_data import find_package_data
@@ -313,5 +313,5 @@ def test_a_recording_of_a_namespace_has_no_diagnostics_of_another(ros, tmp_path,
 
         ros.wait(is_recorded)
     with Bag(tmp_path / "bag") as bag:
-        recorded = {status.name for status in last_diagnostics(bag)}
+        recorded = {status.name for status in find_last_diagnostics(bag)}
     assert recorded == {"/left/driver: rows", "/left/driver: link hub0"}

@@ -363,13 +363,13 @@ def test_a_node_that_ends_with_a_configuration_error_stays_ended(code, starts):
     from launch import LaunchDescription, LaunchService
     from launch.actions import ExecuteProcess
 
-    from cube_tensor_driver.ros.launching import stay_ended
+    from cube_tensor_driver.ros.launching import prevent_restart
 
     ended = []
 
     def on_exit(event, context):
         ended.append(event.returncode)
-        return stay_ended(event, context)
+        return prevent_restart(event, context)
 
     node = ExecuteProcess(
         cmd=[sys.executable, "-c", f"raise SystemExit({code})"],

@@ -21,10 +21,10 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu
 
 from conftest import decoded, encoded
-from cube_tensor_driver.bags.metadata import quality
+from cube_tensor_driver.bags.metadata import describe_quality
 from cube_tensor_driver.bags.read import Bag
 from cube_tensor_driver.bags.reprocess.job import ReprocessJob, reconstruct, reprocess
-from cube_tensor_driver.bags.reprocess.table import frequency_table, reprocess_table
+from cube_tensor_driver.bags.reprocess.table import read_frequency_table, reprocess_table
 from cube_tensor_driver.bags.source import open_bag
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.config.calibration import write_calibration
@@ -306,7 +306,7 @@ def write_bag(folder, node, rows: FrequencyRows, dropped: range) -> None:
     frequencies = [encoded(scan, b"tool\0") for scan in scans]
     with BagWriter(folder) as writer:
         for topic, kind in topics.items():
-            writer.add_topic(f"/{topic}", kind, [quality(latched=topic == "info")])
+            writer.add_topic(f"/{topic}", kind, [describe_quality(latched=topic == "info")])
         writer.write("/info", START_NS, serialize_message(node.sent["info"][-1]))
         for k, scan in enumerate(scans):
             time_ns = int(scan.stamp_ns[0])
@@ -347,7 +347,7 @@ def test_a_bag_gives_the_bits_of_the_node_from_every_state_on(start, monkeypatch
     with open_bag(tmp_path / "later") as source:
         found = concatenate([stress for _, stress in reconstruct(source)])
     with open_bag(tmp_path / "later") as source:
-        table = reprocess_table(frequency_table(source), source.skin)
+        table = reprocess_table(read_frequency_table(source), source.skin)
     for name in ("residual", "status", "left_out"):
         assert table[name].to_numpy().tobytes() == getattr(found, name).tobytes(), name
     assert table["stress_zz_Pa"].to_numpy().tobytes() == found.stress[:, 2].tobytes()
@@ -388,7 +388,7 @@ def test_uncertain_rows_are_reprocessed_to_the_bytes_of_the_node(
     write_bag(tmp_path / "bag", node, rows, range(0))
     reprocess(ReprocessJob(tmp_path / "bag", tmp_path / "again", "bag"))
     with Bag(tmp_path / "again") as bag:
-        again = [entry.data for entry in bag.entries({"/stress"})]
+        again = [entry.data for entry in bag.read_entries({"/stress"})]
     assert again == sent
 
 

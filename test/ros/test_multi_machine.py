@@ -147,7 +147,7 @@ def wait(done: Callable[[], object], seconds: float = 60.0) -> None:
 def rows(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Cube, sequence and time of arrival (ns) of all rows of `stress`."""
     with Bag(path) as bag:
-        (topic,) = bag.topics(STRESS)
+        (topic,) = bag.list_topics(STRESS)
         messages = [(message, time_ns) for time_ns, message in bag.read_decoded({topic})]
     cube, sequence = (
         np.concatenate([getattr(one, name) for one, _ in messages]) for name in ("cube", "sequence")

@@ -83,12 +83,14 @@ def test_wrenches_are_the_integral_of_traction(skin_file):
         torque = np.cross(point, force).sum(axis=0)
         expected = np.r_[force.sum(axis=0), torque]
         # Shear with its point has no torque about z; float32 carries 6e-8, the grid 2.5e-5.
-        np.testing.assert_allclose(wrenches.values()[number], expected, rtol=1e-4, atol=1e-9)
+        np.testing.assert_allclose(
+            wrenches.compute_wrenches()[number], expected, rtol=1e-4, atol=1e-9
+        )
         rotation = rotation_from_rpy(*cube.rpy)
         placed = np.asarray(cube.xyz) + point @ rotation.T
         turned = force @ rotation.T
         total += np.r_[turned.sum(axis=0), np.cross(placed, turned).sum(axis=0)]
-    np.testing.assert_allclose(wrenches.values()[4], total, rtol=1e-4, atol=1e-8)
+    np.testing.assert_allclose(wrenches.compute_wrenches()[4], total, rtol=1e-4, atol=1e-8)
     assert wrenches.names == [*skin.names, skin.name]
 
 
@@ -101,7 +103,7 @@ def test_an_unknown_wrench_is_nan(skin_file):
     wrenches = SkinWrenches(skin, None, STALE_S)
 
     def known():
-        return np.isfinite(wrenches.values()).all(axis=1).tolist()
+        return np.isfinite(wrenches.compute_wrenches()).all(axis=1).tolist()
 
     ones, zeros = np.ones((4, 6)), np.zeros((4, 9))
     wrenches.update(stress_rows(range(3), ones[:3], zeros[:3]), 1.0)

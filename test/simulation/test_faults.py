@@ -165,7 +165,7 @@ def test_unplug_takes_the_power_and_rename_comes_back_elsewhere():
     assert not link.line.plugged and not link.hub.started and link.hub.boots == 0
     link.play(12)
     assert link.line.plugged and link.hub.boots == 1 and link.line.port.name == "hub0_1"
-    assert isinstance(Decoder().feed(link.hub.hello())[0], Hello)
+    assert isinstance(Decoder().feed(link.hub.make_hello())[0], Hello)
 
 
 @pytest.mark.parametrize(
@@ -261,7 +261,7 @@ def test_the_load_stays_while_it_is_held():
     loads = []
     for now_us in range(0, 50_000, PERIOD_US):
         link.injector.step(now_us)
-        loads.append(link.load_us(now_us))
+        loads.append(link.find_load_time_us(now_us))
     expected = np.arange(0, 50_000, PERIOD_US)
     expected[(expected >= 10_000) & (expected < 20_000)] = 10_000
     expected[(expected >= 20_000) & (expected < 40_000)] = 20_000

@@ -19,7 +19,7 @@ from cube_tensor_driver.config.skin import Skin, SkinCube, read_skin
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.tensor import rotation_from_rpy
 from cube_tensor_driver.mechanics import contact
-from cube_tensor_driver.simulation.load import Load, default_script
+from cube_tensor_driver.simulation.load import Load, read_default_script
 from cube_tensor_driver.simulation.spline import CubicSpline
 
 ONE = read_skin(find_package_data() / "config" / "cube.yaml").cubes[0]
@@ -63,8 +63,8 @@ def test_cubes_below_carry_the_load(tmp_path):
     inside = np.hypot(x, y) <= reach
     places = np.stack([x[inside], y[inside], 0 * x[inside]], axis=1)
     load = Load(skin_of(places), script_of(tmp_path, PRESS, radius=0.001, poisson=0.5))
-    stress, gradient = load.at(1.5)
-    force, centre, normal = load.total(1.5)
+    stress, gradient = load.compute_stress_field(1.5)
+    force, centre, normal = load.compute_resultant(1.5)
     np.testing.assert_allclose(force, [0.6, -0.3, -2.0], rtol=1e-12)
     np.testing.assert_allclose(centre, PRESS["press"]["at"])
     np.testing.assert_array_equal(normal, [0, 0, 1])
@@ -94,7 +94,7 @@ def test_on_the_axis_of_a_disc_and_of_a_sphere(tmp_path, shape, radius):
         young=0.4e6,
         poisson=0.45,
     )
-    stress, _ = Load(skin_of(np.zeros((1, 3))), script).at(1.5)
+    stress, _ = Load(skin_of(np.zeros((1, 3))), script).compute_stress_field(1.5)
     if shape == "disc":
         expected = -3.0 / (np.pi * radius**2) * (1 - H**3 / np.hypot(radius, H) ** 3)
     else:
@@ -112,7 +112,7 @@ def test_few_points_from_afar_are_as_good(tmp_path):
         load = Load(
             skin_of(places), script_of(tmp_path, PRESS, shape=shape, radius=radius, poisson=0.5)
         )
-        found = load.at(1.5)
+        found = load.compute_stress_field(1.5)
         press = load.find_contact_loads(1.5)[0]
         sources, forces = getattr(contact, "hertz" if shape == "sphere" else shape)(
             press.radius, press.force, order=24
@@ -125,7 +125,7 @@ def test_few_points_from_afar_are_as_good(tmp_path):
 def test_mirrored_cubes_see_mirrored_stress(tmp_path):
     places = np.array([[x, y, 0.0] for x in (-0.01, 0.01) for y in (-0.005, 0.005)])
     script = script_of(tmp_path, {"press": {"from": 0, "to": 3, "at": [0, 0, 0], "force": 3.0}})
-    stress, gradient = Load(skin_of(places), script).at(1.5)
+    stress, gradient = Load(skin_of(places), script).compute_stress_field(1.5)
     odd = np.array([1, 1, 1, 1, -1, -1])  # zx and xy change sign under x → −x
     scale = 1e-12 * np.abs(stress).max()
     np.testing.assert_allclose(stress[2:], stress[:2] * odd, atol=scale)
@@ -148,11 +148,13 @@ def test_a_slide_is_a_press_moved(tmp_path):
     }
     press = Load(skin, script_of(tmp_path, {"press": in_place}))
     # 1.5 × 50 mm in 2 s in the middle: (FRICTION_SPEED / v)² / 2 is missing of the friction
-    for sliding, still in zip(slide.at(1.0), press.at(1.0), strict=True):
+    for sliding, still in zip(
+        slide.compute_stress_field(1.0), press.compute_stress_field(1.0), strict=True
+    ):
         np.testing.assert_allclose(sliding, still, atol=1e-3 * np.abs(still).max())
     roll = Load(skin, script_of(tmp_path, {"roll": moved}))
-    np.testing.assert_allclose(roll.total(1.0)[0], [0, 0, -3], atol=1e-12)
-    np.testing.assert_allclose(roll.total(1.0)[1], [0.005, 0.02, 0])
+    np.testing.assert_allclose(roll.compute_resultant(1.0)[0], [0, 0, -3], atol=1e-12)
+    np.testing.assert_allclose(roll.compute_resultant(1.0)[1], [0.005, 0.02, 0])
     # at rest at both ends
     np.testing.assert_allclose(slide.find_contact_loads(1e-6)[0].position, [-0.01, 0, 0], atol=1e-9)
 
@@ -167,7 +169,7 @@ def test_the_curve_of_a_path_is_the_cubic_spline_of_scipy(points, closed):
     ends = "periodic" if closed else "clamped"
     expected = interpolate.CubicSpline(np.linspace(0, 1, len(path)), path, bc_type=ends)
     for time in np.linspace(0, 1, 41):
-        position, velocity = curve.at(time)
+        position, velocity = curve.interpolate(time)
         np.testing.assert_allclose(position, expected(time), atol=1e-12)
         np.testing.assert_allclose(velocity, expected(time, 1), atol=1e-10)
 
@@ -182,7 +184,7 @@ def test_taps_presses_and_the_time_between(tmp_path):
     )
     load = Load(skin, script)
     times = np.arange(0, 20, 0.005)
-    force = -np.array([load.total(time)[0][2] for time in times])
+    force = -np.array([load.compute_resultant(time)[0][2] for time in times])
     np.testing.assert_allclose(force[:2000], force[2000:], atol=1e-9)  # it begins anew
     peaks = (
         np.flatnonzero((force[1:-1] > force[:-2]) & (force[1:-1] > force[2:]) & (times[1:-1] < 10))
@@ -190,7 +192,9 @@ def test_taps_presses_and_the_time_between(tmp_path):
     )
     np.testing.assert_allclose(times[peaks], 5.0 + 0.125 + 0.25 * np.arange(4), atol=0.006)
     np.testing.assert_allclose(force[peaks], 2.0, rtol=1e-3)
-    assert not force[(times >= 3) & (times < 5)].any() and not load.at(4.0)[0].any()
+    assert (
+        not force[(times >= 3) & (times < 5)].any() and not load.compute_stress_field(4.0)[0].any()
+    )
     assert force[300] == pytest.approx(1.0)
     # half cosines: as steep as π/2 × peak / (an eighth of a second) at most
     assert np.abs(np.diff(force)).max() <= 0.005 * np.pi / 2 * 2.0 / 0.125 * (1 + 1e-9)
@@ -212,7 +216,9 @@ def test_turning_skin_and_load_changes_nothing(tmp_path):
     for key in ("at", "shear"):
         turned["press"][key] = (turn @ PRESS["press"][key]).tolist()
     other = Load(skin_of(places @ turn.T, np.tile(rpy, (12, 1))), script_of(tmp_path, turned))
-    for one, two in zip(flat.at(1.0), other.at(1.0), strict=True):
+    for one, two in zip(
+        flat.compute_stress_field(1.0), other.compute_stress_field(1.0), strict=True
+    ):
         np.testing.assert_allclose(one, two, atol=1e-9 * np.abs(one).max())
 
 
@@ -222,20 +228,26 @@ def test_a_cube_that_faces_away_sees_nothing(tmp_path):
     rpy = np.stack([0 * angle, angle, 0 * angle], axis=1)
     script = script_of(tmp_path, {"press": {"from": 0, "to": 3, "at": [0, 0, 0.044], "force": 3.0}})
     load = Load(skin_of(places, rpy), script)
-    top = np.abs(load.at(1.5)[0]).max(axis=1)
+    top = np.abs(load.compute_stress_field(1.5)[0]).max(axis=1)
     assert (np.diff(top[:3]) < 0).all() and not top[3:8].any()
     np.testing.assert_allclose(top[[8, 9]], top[[2, 1]])
-    np.testing.assert_allclose(load.total(1.5)[0], [0, 0, -3], atol=1e-6)
+    np.testing.assert_allclose(load.compute_resultant(1.5)[0], [0, 0, -3], atol=1e-6)
 
 
 def test_the_shipped_script_is_the_same_in_every_process_and_never_lets_go():
     skin = read_skin(find_package_data() / "config" / "skin_demo.yaml")
-    one, two = Load(skin, default_script()), Load(skin, default_script())
+    one, two = Load(skin, read_default_script()), Load(skin, read_default_script())
     assert one.period == 8.0
     for time in np.arange(0, 8, 0.37):
-        np.testing.assert_array_equal(one.at(time)[0], two.at(time)[0])
-        np.testing.assert_allclose(one.at(time)[0], two.at(time + 8 * one.period)[0], rtol=1e-9)
-        assert 0.3 - 1e-9 <= -one.total(time)[0][2] <= 3.0 + 1e-9
+        np.testing.assert_array_equal(
+            one.compute_stress_field(time)[0], two.compute_stress_field(time)[0]
+        )
+        np.testing.assert_allclose(
+            one.compute_stress_field(time)[0],
+            two.compute_stress_field(time + 8 * one.period)[0],
+            rtol=1e-9,
+        )
+        assert 0.3 - 1e-9 <= -one.compute_resultant(time)[0][2] <= 3.0 + 1e-9
 
 
 GOOD = {

@@ -98,7 +98,7 @@ def test_discs_are_those_of_point_forces():
     cubes[0, :2] = middle[0]  # right below: the direction to the disc is lost there
     radius = CONTACT_SIZES[[0, 4, 8, 12, 16, 18]] * DEPTH
     place = cubes[:, None, :2] - middle
-    stress, gradient = DiscTables(Layer(poisson=0.3), DEPTH).field(
+    stress, gradient = DiscTables(Layer(poisson=0.3), DEPTH).compute_field(
         place, np.broadcast_to(forces, (20, 6, 3)), radius
     )
     exact = [
@@ -115,7 +115,7 @@ def test_discs_far_away_act_within_the_noise_of_a_pad(depths):
     """The tables end at 20 depths, where 3 N that rub cause 73 Pa. The noise of a pad is 3 Pa."""
     force, place = np.array([0.9, 0.0, -3.0]), depths * DEPTH * np.array([1.0, 0.0])
     tables = DiscTables(Layer(poisson=0.48), DEPTH)
-    stress, _ = tables.field(place[None, None], force[None, None], np.array([3e-3]))
+    stress, _ = tables.compute_field(place[None, None], force[None, None], np.array([3e-3]))
     load = contact.hertz(3e-3, force, (0, 0), order=8)
     expected, _ = contact.field(np.array([[*place, -DEPTH]]), *load, 0.48)
     np.testing.assert_allclose(stress, expected, atol=2.0)
@@ -128,7 +128,9 @@ def under(polygon: Polygon, cubes: np.ndarray, layer: Layer) -> tuple[np.ndarray
     foot = np.column_stack([cubes, np.zeros(len(cubes))]) - polygon.centre
     traction = polygon.traction + polygon.twist * np.cross([0.0, 0.0, 1.0], foot)
     traction = np.repeat(traction[:, None], start.shape[1], axis=1)
-    return PolygonTables(layer, DEPTH).field(start, np.roll(start, -1, axis=1), traction, twist)
+    return PolygonTables(layer, DEPTH).compute_field(
+        start, np.roll(start, -1, axis=1), traction, twist
+    )
 
 
 def point_forces(polygon: Polygon, order: int) -> tuple[np.ndarray, np.ndarray]:
@@ -178,7 +180,7 @@ def test_a_square_on_a_layer_is_that_of_its_waves():
     element = np.repeat(weight * 8 / DEPTH * k, 192) / 192 / (2 * np.pi)
     spectrum = 4 * np.sin(half * kx) * np.sin(half * ky) / (kx * ky) * element
     waves = np.exp(1j * (cubes @ [kx, ky])) * spectrum
-    expected = (waves @ (layer.transfer(kx, ky, DEPTH) @ square.traction)).real
+    expected = (waves @ (layer.compute_transfer(kx, ky, DEPTH) @ square.traction)).real
     stress, gradient = under(square, cubes, layer)
     for found, wanted in ((stress, expected[:, :6]), (gradient, expected[:, 6:].reshape(-1, 6, 3))):
         assert np.abs(found - wanted).max() < 4e-3 * np.abs(wanted).max()
@@ -261,10 +263,15 @@ def test_shipped_scenes(mujoco, scene, seconds, force):
     path = SCENES / f"{scene}.xml"
     skin = read_skin(find_scene_skin(path))
     load = MujocoLoad(path, skin)
-    np.testing.assert_allclose(load.total(seconds)[0], force, atol=0.02 * np.linalg.norm(force))
-    once = np.concatenate(load.at(seconds), axis=None)
-    load.at(0.5 * seconds)
-    again = load.at(load.period + seconds), MujocoLoad(path, skin).at(seconds)
+    np.testing.assert_allclose(
+        load.compute_resultant(seconds)[0], force, atol=0.02 * np.linalg.norm(force)
+    )
+    once = np.concatenate(load.compute_stress_field(seconds), axis=None)
+    load.compute_stress_field(0.5 * seconds)
+    again = (
+        load.compute_stress_field(load.period + seconds),
+        MujocoLoad(path, skin).compute_stress_field(seconds),
+    )
     for fields in again:
         np.testing.assert_array_equal(np.concatenate(fields, axis=None), once)
     rows = next(iter(simulate(skin, load, rate=100.0)))
@@ -276,9 +283,9 @@ def test_a_scene_without_keyframes_goes_on_and_is_the_same_when_asked_again(mujo
     path.write_text(BOX.replace('timestep="0.001"', 'timestep="0.005"'))
     load = MujocoLoad(path, pad())
     assert load.repeats is None
-    first = load.total(0.02)[0]
-    np.testing.assert_allclose(load.total(2.5)[0], [0, 0, -WEIGHT], atol=0.02 * WEIGHT)
-    np.testing.assert_array_equal(load.total(0.02)[0], first)
+    first = load.compute_resultant(0.02)[0]
+    np.testing.assert_allclose(load.compute_resultant(2.5)[0], [0, 0, -WEIGHT], atol=0.02 * WEIGHT)
+    np.testing.assert_array_equal(load.compute_resultant(0.02)[0], first)
 
 
 @pytest.mark.parametrize(

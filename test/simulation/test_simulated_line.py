@@ -14,7 +14,7 @@ from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.device.wire.decoder import Decoder
 from cube_tensor_driver.device.wire.protocol import Command, Request, Sample, encode
-from cube_tensor_driver.simulation.load import Load, default_script
+from cube_tensor_driver.simulation.load import Load, read_default_script
 from cube_tensor_driver.simulation.simulator import FIRST_BOOT_US, Simulator, StopRequest
 
 PERIOD_S = 0.5
@@ -29,7 +29,7 @@ def test_a_large_sample_arrives_before_the_next_is_taken(tmp_path):
     path = tmp_path / "skin.yaml"
     write_yaml(path, describe_grid(nx=N_CUBES, ny=1, pitch=0.01, rate=1 / PERIOD_S))
     skin = read_skin(path)
-    load = Load(skin, default_script())
+    load = Load(skin, read_default_script())
     simulator = Simulator(skin, load, tmp_path / "ports", instants=1)
     stop = StopRequest()
     thread = threading.Thread(target=simulator.run, args=(stop,))

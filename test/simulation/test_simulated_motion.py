@@ -20,7 +20,7 @@ POSES = CubePoses(np.array([[R, 0.0, 0.0]]), TILT[None], np.array([0.002]))
 
 
 def force_at(seconds, *knots):
-    return HeavyPads(np.eye(3), POSES, knots).stress(seconds)[0]
+    return HeavyPads(np.eye(3), POSES, knots).compute_stress(seconds)[0]
 
 
 def test_a_skin_that_is_held_still_feels_its_weight():

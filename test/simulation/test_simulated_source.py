@@ -39,7 +39,7 @@ from cube_tensor_driver.simulation.cubes import (
     make_hub_cubes,
 )
 from cube_tensor_driver.simulation.hub import SimulatedHub
-from cube_tensor_driver.simulation.load import Load, default_script
+from cube_tensor_driver.simulation.load import Load, read_default_script
 from cube_tensor_driver.simulation.sample_log import SampleLog
 from cube_tensor_driver.simulation.source import simulate
 
@@ -50,7 +50,7 @@ SKIN = read_skin(FILE)
 def test_the_load_comes_out_again():
     """To what rounding leaves: half a mHz, and half of the last of 24 bits, of a pad's frequency;
     each pad's error passes its law and the matrix from pads to components."""
-    load = Load(SKIN, default_script())
+    load = Load(SKIN, read_default_script())
     reconstruct = Reconstructor(SKIN, np.float64)
     calibration = SKIN.cubes[0].calibration
     rest, beta, modulus = law = (
@@ -63,7 +63,7 @@ def test_the_load_comes_out_again():
     scans = 0
     for rows in simulate(SKIN, load, rate=50.0, duration=1.0):
         found = reconstruct(rows)
-        stress, gradient = load.at(1e-9 * rows.stamp_ns[0])
+        stress, gradient = load.compute_stress_field(1e-9 * rows.stamp_ns[0])
         frequency = compute_pad_frequency(
             compute_true_state(calibration, stress, gradient) @ calibration.response.T, *law
         )
@@ -83,12 +83,14 @@ def test_the_load_comes_out_again():
 
 def test_values_are_those_that_a_hub_sends():
     hubs = make_hub_cubes(SKIN, PadErrors(1e-5, 1e-4))
-    load = Load(SKIN, default_script())
+    load = Load(SKIN, read_default_script())
     source = simulate(SKIN, load, rate=100.0, noise=1e-5, drift=1e-4)
     for number, rows in enumerate(islice(source, 20)):
         sent = []
         for hub in hubs:
-            millihertz = hub.frequency(*load.at(0.01 * number), 0.01 * number)
+            millihertz = hub.compute_frequency(
+                *load.compute_stress_field(0.01 * number), 0.01 * number
+            )
             device = SimulatedHub(
                 uid=1, cube_uids=list(range(len(hub.members))), n_pads=hub.cubes.n_pads
             )
@@ -205,7 +207,7 @@ def test_noise_of_the_calibration_gives_a_residual_of_one_and_the_stated_deviati
     calibration = read_calibration(find_calibration(layout, Path()))
     n = 2000
     cubes = SimulatedCubes([calibration] * n, PadErrors(noise=None))
-    millihertz = cubes.frequency(np.zeros((n, 6)), np.zeros((n, 6, 3)), 0.0)
+    millihertz = cubes.compute_frequency(np.zeros((n, 6)), np.zeros((n, 6, 3)), 0.0)
     rows = Reconstructor([calibration] * n).process(
         FrequencyRows.from_values(np.arange(n), (millihertz * 1e-3).astype(np.float32))
     )

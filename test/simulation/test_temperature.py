@@ -89,14 +89,14 @@ def test_warm_pads_have_the_computed_stress_and_drift():
     ]
     pattern = cubes(temperature=warm, air=warm, pad_drift=0.0)
     both = cubes(temperature=warm, air=warm)
-    assert np.abs(read_stress(pattern.frequency(*UNLOADED, 0.0))).max() < 0.01
-    early = read_stress(pattern.frequency(*UNLOADED, 60.0))[0]
-    late = read_stress(pattern.frequency(*UNLOADED, 7200.0))[0]
+    assert np.abs(read_stress(pattern.compute_frequency(*UNLOADED, 0.0))).max() < 0.01
+    early = read_stress(pattern.compute_frequency(*UNLOADED, 60.0))[0]
+    late = read_stress(pattern.compute_frequency(*UNLOADED, 7200.0))[0]
     np.testing.assert_allclose(late, 10 * stress, atol=0.5)
     assert (np.abs(early) < 0.5 * np.abs(late)).all()
-    assert pattern.temperature(60.0) == 35.0 and np.isnan(cubes().temperature(60.0))
+    assert pattern.compute_temperature(60.0) == 35.0 and np.isnan(cubes().compute_temperature(60.0))
     # 100 ppm/K are 39 Pa/K (docs/build.md), here of a foam that is strained by 0.5 % at most.
-    late_both = read_stress(both.frequency(*UNLOADED, 7200.0))[0]
+    late_both = read_stress(both.compute_frequency(*UNLOADED, 7200.0))[0]
     np.testing.assert_allclose(late_both - late, 390.0, rtol=0.01)
 
 
@@ -110,7 +110,7 @@ def test_layers_and_drift_differ_by_the_asked_spread():
     many = SimulatedCubes([calibration] * 50, PadErrors(imperfections=wanted))
     zero = np.zeros((50, 6)), np.zeros((50, 6, 3))
     drift = (
-        read_stress(many.frequency(*zero, 7200.0))
+        read_stress(many.compute_frequency(*zero, 7200.0))
         - 10 * read_thermal_stress("cube_11mm", 24).pads[:, 0]
     )
     assert drift.std() == pytest.approx(0.2 * 390, rel=4 / np.sqrt(2 * 1200))

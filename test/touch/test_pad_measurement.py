@@ -61,7 +61,7 @@ def said(influence, number: int, place: np.ndarray, angle: float) -> np.ndarray:
     pads = [LAYOUTS["cube"].pads.index(pad) for pad in calibration.layout.pads]
     c, s = np.cos(angle), np.sin(angle)
     turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-    seen = influence.at(place @ turn[:2, :2].T)[pads]
+    seen = influence.interpolate(place @ turn[:2, :2].T)[pads]
     matrix = np.nan_to_num(Pipeline([calibration]).find_matrix(0)) * UNITS[:, None]
     return np.einsum("cp,pni,ij->ncj", matrix, seen, turn)
 
@@ -72,7 +72,7 @@ def test_a_contact_is_the_sum_of_its_forces(influence, cubes, size):
     random = np.random.default_rng(3)
     place, angle = random.uniform(-0.012, 0.012, (12, 2)), random.uniform(-3, 3, 12)
     which = np.arange(12) % 2
-    found = ContactResponse(cubes).response(place, angle, which, size)
+    found = ContactResponse(cubes).compute_response(place, angle, which, size)
     sources, forces = contact.hertz(size, [0, 0, 1.0], order=8)
     expected = np.stack(
         [
@@ -97,9 +97,11 @@ def test_covariances_of_the_prior_are_sums_over_the_surface(influence, cubes):
     expected = np.einsum("nci,ndi->cd", cross, seen[1])
     first, second = np.array([0]), np.array([1])
     covariances = TractionPrior(cubes)
-    found = covariances.covariance(place[:1] - place[1:], angle[:1], first, angle[1:], second)[0]
+    found = covariances.compute_covariance(
+        place[:1] - place[1:], angle[:1], first, angle[1:], second
+    )[0]
     own = [
-        np.diag(covariances.covariance(np.zeros((1, 2)), angle[:1], k, angle[:1], k)[0])
+        np.diag(covariances.compute_covariance(np.zeros((1, 2)), angle[:1], k, angle[:1], k)[0])
         for k in (first, second)
     ]
     observed = np.outer(*own) > 0
@@ -107,7 +109,7 @@ def test_covariances_of_the_prior_are_sums_over_the_surface(influence, cubes):
     assert (np.abs(found - expected) <= 4e-3 * np.sqrt(np.outer(*own)))[observed].all()
     assert not found[~observed].any()
     (here,) = np.flatnonzero((np.abs(points - [0.0, 2 * step]) < 1e-9).all(axis=1))
-    found = covariances.cross(place[:1] - points[here], angle[:1], first)[0]
+    found = covariances.compute_traction_covariance(place[:1] - points[here], angle[:1], first)[0]
     assert np.abs(found - cross[here]).max() < 2e-3 * np.abs(cross[here]).max()
 
 

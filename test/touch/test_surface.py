@@ -71,21 +71,23 @@ def test_cubes_without_a_tensor_are_filled_in_by_the_others():
     assert np.abs(hole - full).max() < 0.25 * full.max()
     values[:] = np.nan
     assert np.isnan(surface.field(values).pressure).all()
-    assert surface.contacts(values, CONTACT_PRESSURE) == []
+    assert surface.find_contacts(values, CONTACT_PRESSURE) == []
 
 
 def test_weights_solved_anew_for_some_cubes_are_those_of_a_new_surface():
     skin = flat(7, 7, 0.006)
     surface, values = Surface(skin, DEPTH), measured(skin, 0.02, (1, 0, -3), np.zeros(2))
-    surface.contacts(values, CONTACT_PRESSURE)
+    surface.find_contacts(values, CONTACT_PRESSURE)
     values[10], values[30, 12:] = np.nan, np.nan
     anew = Surface(skin, DEPTH)
     (known,), (new,) = (
-        surface.contacts(values, CONTACT_PRESSURE),
-        anew.contacts(values, CONTACT_PRESSURE),
+        surface.find_contacts(values, CONTACT_PRESSURE),
+        anew.find_contacts(values, CONTACT_PRESSURE),
     )
     np.testing.assert_array_equal(surface.field(values).pressure, anew.field(values).pressure)
-    np.testing.assert_array_equal(surface.uncertainty(values), anew.uncertainty(values))
+    np.testing.assert_array_equal(
+        surface.compute_uncertainty(values), anew.compute_uncertainty(values)
+    )
     np.testing.assert_array_equal(known.position, new.position)
 
 
@@ -95,14 +97,16 @@ def test_a_contact_beside_cubes_of_which_nothing_is_known_is_finite():
     values[skin.position[:, 0] > 0.01] = np.nan
     surface = Surface(skin, DEPTH)
     assert np.isnan(surface.field(values).pressure).any()
-    (found,) = surface.contacts(values, CONTACT_PRESSURE)
+    (found,) = surface.find_contacts(values, CONTACT_PRESSURE)
     assert found.normal_force == pytest.approx(2, rel=0.1) and np.isfinite(found.position).all()
 
 
 def test_contact_has_the_load_s_place_and_force():
     skin = flat(9, 9, 0.006)
     force, centre = np.array([0.6, -0.4, -3.0]), np.array([0.0023, -0.0031])
-    (found,) = Surface(skin, DEPTH).contacts(measured(skin, 0.012, force, centre), CONTACT_PRESSURE)
+    (found,) = Surface(skin, DEPTH).find_contacts(
+        measured(skin, 0.012, force, centre), CONTACT_PRESSURE
+    )
     # What spreads beyond a skin of 54 mm is lost: 3 (1 - (1 + (27/4)²)^-3/2) N is 0.3 % less.
     assert found.normal_force == pytest.approx(3.0, rel=0.02)
     # Shear falls as 3 depth x² / (2 π r⁵): 1.5 depth / 27 mm of it lies outside.
@@ -119,7 +123,7 @@ def test_two_contacts_are_two_the_stronger_first():
     skin = flat(15, 5, 0.006)
     left, right = np.array([-0.03, 0.0]), np.array([0.03, 0.002])
     values = measured(skin, 0.008, (0, 0, -1), left) + measured(skin, 0.008, (0, 0, -2), right)
-    first, second = Surface(skin, DEPTH).contacts(values, CONTACT_PRESSURE)
+    first, second = Surface(skin, DEPTH).find_contacts(values, CONTACT_PRESSURE)
     assert first.normal_force == pytest.approx(2, rel=0.1)
     assert second.normal_force == pytest.approx(1, rel=0.1)
     assert np.linalg.norm(first.position[:2] - right) < 1e-3
@@ -139,8 +143,8 @@ def test_a_turned_skin_gives_the_turned_field():
         turned.field(values).pressure, straight.field(values).pressure, atol=1e-6 * peak
     )
     (a,), (b,) = (
-        straight.contacts(values, CONTACT_PRESSURE),
-        turned.contacts(values, CONTACT_PRESSURE),
+        straight.find_contacts(values, CONTACT_PRESSURE),
+        turned.find_contacts(values, CONTACT_PRESSURE),
     )
     np.testing.assert_allclose(b.position, turn @ a.position + [1, 2, 3], atol=1e-8)
     np.testing.assert_allclose(b.force, turn @ a.force, atol=1e-6)
@@ -154,12 +158,16 @@ def test_what_no_surface_is(depth, side):
 
 def test_the_view_s_squares_have_the_colour_of_their_value():
     from cube_tensor_driver.views import scene
-    from cube_tensor_driver.views.meshes import COLOUR_STEPS, find_colour_steps, step_colours
+    from cube_tensor_driver.views.meshes import (
+        COLOUR_STEPS,
+        compute_step_colours,
+        find_colour_steps,
+    )
 
     for name in ("pressure", "zz"):
         quantity = scene.QUANTITIES[name]
         shown = np.append(np.linspace(-12e3, 12e3, 301), np.nan)
-        colours = step_colours(quantity)[find_colour_steps(quantity, shown, 10e3)]
+        colours = compute_step_colours(quantity)[find_colour_steps(quantity, shown, 10e3)]
         expected = 255 * scene.choose_colours(quantity, shown, 10e3)
         # half a step, where the scale is steepest
         scale = 255 * scene.choose_colours(quantity, np.linspace(-10e3, 10e3, 2000), 10e3)

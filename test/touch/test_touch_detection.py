@@ -375,7 +375,7 @@ def test_response_of_a_small_load_is_that_of_point_forces_and_of_the_tables():
         (LoadResponse(Layer(), DEPTH, 5e-3)(offset, np.zeros(200)), expected),
         (
             LoadResponse(layer, DEPTH, 5e-3)(offset, angle),
-            responses.response(offset, angle, np.zeros(200, int), 2.5e-3),
+            responses.compute_response(offset, angle, np.zeros(200, int), 2.5e-3),
         ),
     ):
         largest = np.abs(truth).max(axis=(0, 2), keepdims=True)

@@ -20,7 +20,7 @@ from cube_tensor_driver.device.wire.protocol import TEMPERATURE_UNKNOWN
 from cube_tensor_driver.simulation.cubes import SimulatedCubes
 from cube_tensor_driver.simulation.faults import PAD_FAULTS, Fault
 from cube_tensor_driver.simulation.injector import compute_broken_reading
-from cube_tensor_driver.simulation.load import Load, default_script
+from cube_tensor_driver.simulation.load import Load, read_default_script
 from cube_tensor_driver.simulation.sample_log import FaultRecord, LinkLog, SampleLog, SampleRun
 from workshop.checks.all_checks import check_all
 from workshop.checks.record import NodeAction, Received, Record, Samples
@@ -70,9 +70,11 @@ def played(tmp_path_factory):
 @cache
 def sound_readings(skin):
     """(instants, cubes, pads) in mHz."""
-    load, cubes = Load(skin, default_script()), SimulatedCubes(skin.calibrations)
+    load, cubes = Load(skin, read_default_script()), SimulatedCubes(skin.calibrations)
     times = load.period * np.arange(INSTANTS) / INSTANTS
-    return np.array([cubes.frequency(*load.at(time), 0.0) for time in times])
+    return np.array(
+        [cubes.compute_frequency(*load.compute_stress_field(time), 0.0) for time in times]
+    )
 
 
 def sent_readings(skin, log):

@@ -28,7 +28,7 @@ from cube_tensor_driver.core.arrays import Array, Index
 from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.demo.running import observe_skin
 from cube_tensor_driver.demo.usage import Usage
-from cube_tensor_driver.demo.verification import compare, percentile
+from cube_tensor_driver.demo.verification import compare, compute_percentile
 from cube_tensor_driver.messages.codec import stress_codec
 from cube_tensor_driver.msg import SkinContacts, SkinStress, SkinTouch
 from cube_tensor_driver.processes.children import Children
@@ -250,8 +250,8 @@ def _measure_skin(
         "tensors_received": comparison.received,
         "lost": comparison.missing,
         "skipped": skipped,
-        "latency_p50_ms": percentile(comparison.latency_ms, 50),
-        "latency_p99_ms": percentile(comparison.latency_ms, 99),
+        "latency_p50_ms": compute_percentile(comparison.latency_ms, 50),
+        "latency_p99_ms": compute_percentile(comparison.latency_ms, 99),
         **{f"cpu_{name}_percent": round(value, 1) for name, value in cpu.items()},
         **summarise_memory(measured.memory_mb),
         "first_tensor_s": round(measured.first_tensor_s, 2),
@@ -282,8 +282,8 @@ def _summarise_found(
     latency_ms = latency_ms[(stamp_ns > measured.start_ns) & (stamp_ns < measured.end_ns)]
     return {
         f"{bench.topic}_messages": len(latency_ms),
-        f"{bench.topic}_latency_p50_ms": percentile(latency_ms, 50),
-        f"{bench.topic}_latency_p99_ms": percentile(latency_ms, 99),
+        f"{bench.topic}_latency_p50_ms": compute_percentile(latency_ms, 50),
+        f"{bench.topic}_latency_p99_ms": compute_percentile(latency_ms, 99),
     }
 
 

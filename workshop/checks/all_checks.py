@@ -11,7 +11,7 @@ import numpy as np
 
 from cube_tensor_driver.core.arrays import Records
 from cube_tensor_driver.core.matching import NO_MATCH
-from cube_tensor_driver.demo.verification import percentile
+from cube_tensor_driver.demo.verification import compute_percentile
 from cube_tensor_driver.simulation.sample_log import SampleLog
 
 from .counters import check_counters
@@ -68,7 +68,7 @@ def check_all(
         "worst_reconnect_s": round(max(reconnects_s, default=0.0), 3),
         "stamps_judged": len(stamp_errors_ms),
         **{
-            f"stamp_error_p{percent}_ms": percentile(stamp_errors_ms, percent)
+            f"stamp_error_p{percent}_ms": compute_percentile(stamp_errors_ms, percent)
             for percent in PERCENTILES
         },
     }

@@ -136,7 +136,7 @@ def _draw_gripper(path: Path) -> None:
     scene = find_package_data() / "config" / "mujoco" / "gripper.xml"
     skin = read_skin(find_scene_skin(scene))
     load = MujocoLoad(scene, skin, noise=None)
-    load.at(SHAKEN_S)  # computes the scene up to this time
+    load.compute_stress_field(SHAKEN_S)  # computes the scene up to this time
     pixels = _render(load)
     links = np.array([cube.link for cube in skin.cubes])
     fingers = {name: np.flatnonzero(links == name) for name in ("left", "right")}

@@ -23,7 +23,7 @@ from ...messages.touch import encode_touch
 from ...messages.types import CONTACTS, TOUCH, TRACTION
 from ...touch.contact_finder import ContactSettings, make_contact_finder
 from ...touch.touch_detection import NO_TOUCHES, Touch, Touches
-from ..metadata import quality
+from ..metadata import describe_quality
 from ..read import make_message, serialise
 from ..recording import make_recorded_skin
 from ..write import BagWriter
@@ -71,12 +71,12 @@ class ContactWriter:
         self._contacts = f"{topics}contacts"
         self._traction = f"{topics}traction"
         self._touches = f"{topics}touch"
-        writer.add_topic(self._touches, TOUCH, [quality()])
-        writer.add_topic(self._contacts, CONTACTS, [quality()])
+        writer.add_topic(self._touches, TOUCH, [describe_quality()])
+        writer.add_topic(self._contacts, CONTACTS, [describe_quality()])
         writer.add_topic(
             self._traction,
             TRACTION,
-            [quality(depth=2)],
+            [describe_quality(depth=2)],
         )
         self._info: SkinInfo | None = None
         self._geometry: list[object] | None = None

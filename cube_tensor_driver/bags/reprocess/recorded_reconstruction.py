@@ -62,11 +62,11 @@ class RecordedReconstruction:
             The health. Where its `known` is false, no stress was recorded for the row, and the
             reconstructor determines the health itself.
         """
-        settings = self._source.recording.settings_at(rows)
+        settings = self._source.recording.find_settings(rows)
         if settings is not self._settings:
             self._settings = settings
             reconstructor.rest_frequency = settings.rest_frequency
-        return self._source.recording.health.at(rows)
+        return self._source.recording.health.find(rows)
 
     def find_compensation(
         self,

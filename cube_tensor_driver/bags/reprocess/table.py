@@ -44,7 +44,7 @@ NUMBER_LIST = pyarrow.list_(pyarrow.float64())
 """Arrow type of the columns with one list of numbers per row."""
 
 
-def frequency_table(source: BagSource) -> pyarrow.Table:
+def read_frequency_table(source: BagSource) -> pyarrow.Table:
     """Read the frequencies of a whole bag into an Arrow table, one row per sample of a cube.
 
     Besides the columns of `COLUMNS`, the table has columns with everything else that determines the
@@ -115,7 +115,7 @@ def reprocess_table(
     """Compute the stress of one recording of one skin, from an Arrow table to an Arrow table.
 
     The result depends on the arguments only, so frameworks such as Ray or Dask can call this
-    function in any process. With a table of `frequency_table` and the skin of the bag, the values
+    function in any process. With a table of `read_frequency_table` and the skin of the bag, the values
     equal those of `./cube reprocess` bit by bit. For a skin with other calibrations, leave out the
     columns of recorded health and rest frequencies (frequencies without load): then faulty pads are
     detected from the frequencies, and the rest frequencies are those of the skin.
@@ -126,7 +126,7 @@ def reprocess_table(
     frequencies of the calibrations, healthy pads and no creep.
 
     Args:
-        frequencies: Rows (samples of cubes) with the columns that `frequency_table` states, of
+        frequencies: Rows (samples of cubes) with the columns that `read_frequency_table` states, of
             which only those of `REQUIRED` must be there.
         skin: The skin with the names and calibrations of the cubes.
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 from ...config.port import TCP
 from ...config.skin import Skin
-from ..wire.protocol import sample_bytes
+from ..wire.protocol import count_sample_bytes
 
 BITS_PER_BYTE = 10
 """Number of bits on a serial line for each byte: a start bit, eight data bits, a stop bit."""
@@ -33,7 +33,7 @@ def find_slow_lines(skin: Skin) -> Iterator[str]:
             continue
         # All cubes of a hub have the same number of pads, so that of the first one is enough.
         n_pads = cubes[0].calibration.layout.n_pads
-        wanted = sample_bytes(len(cubes), n_pads) * skin.rate
+        wanted = count_sample_bytes(len(cubes), n_pads) * skin.rate
         carried = link.baud / BITS_PER_BYTE
         if wanted > carried:
             yield (

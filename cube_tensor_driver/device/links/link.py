@@ -370,9 +370,9 @@ class Link:
         """
         if self._tcp:
             return ()
-        return tuple(_identify_file(path) for path in self._matches())
+        return tuple(_identify_file(path) for path in self._find_matches())
 
-    def _matches(self) -> list[str]:
+    def _find_matches(self) -> list[str]:
         """Return the paths that match the configured port: one, unless it is a pattern."""
         if not self.is_pattern:
             return [self.config.port]
@@ -383,7 +383,7 @@ class Link:
 
         If none can be opened, the error of the last one is raised.
         """
-        paths = self._matches()
+        paths = self._find_matches()
         error = LinkError(
             f"no port matches {self.config.port}: plug the hub in or correct the pattern",
             "no_port",

@@ -411,7 +411,7 @@ def to_hertz(millihertz: NDArray[np.uint32]) -> Single:
     return hertz
 
 
-def sample_bytes(n_cubes: int, n_pads: int) -> int:
+def count_sample_bytes(n_cubes: int, n_pads: int) -> int:
     """Return the largest number of bytes on the wire of one SAMPLE frame.
 
     Args:

@@ -19,7 +19,7 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from ...bags.metadata import quality
+from ...bags.metadata import describe_quality
 from ...bags.repair import repair
 from ...bags.write import BagWriter
 from ...core.errors import BagError
@@ -197,7 +197,7 @@ class Recorder:
         type_name = offers[0].topic_type
         profile = match_offered_profile(offers, QUEUE_DEPTH)
         is_latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
-        recorded_profile = quality(
+        recorded_profile = describe_quality(
             latched=is_latched,
             reliable=profile.reliability == ReliabilityPolicy.RELIABLE,
             depth=QUEUE_DEPTH,

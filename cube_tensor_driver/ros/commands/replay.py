@@ -133,7 +133,7 @@ class Player:
         self._publishers: dict[str, Publisher] = {}
         self._latched: set[str] = set()
         # A bag may contain several skins in different namespaces; each has a topic `frequencies`.
-        skins = [topic.removesuffix("frequencies") for topic in bag.topics(FREQUENCIES)]
+        skins = [topic.removesuffix("frequencies") for topic in bag.list_topics(FREQUENCIES)]
         for connection in bag.connections:
             topic = connection.topic
             is_chosen = stress or not _is_reconstructed(connection, skins)
@@ -260,11 +260,13 @@ class Player:
         Args:
             start_ns: The time, in ns since the Unix epoch.
         """
-        for entry in self._bag.entries(self._latched, stop_ns=start_ns):
+        for entry in self._bag.read_entries(self._latched, stop_ns=start_ns):
             self._publishers[entry.topic].publish(entry.data)
         self.has_begun = True
         self._set_time(start_ns)
-        self._entries: Iterator[Entry] = iter(self._bag.entries(set(self._publishers), start_ns))
+        self._entries: Iterator[Entry] = iter(
+            self._bag.read_entries(set(self._publishers), start_ns)
+        )
         self._next = next(self._entries, None)
         self._shown_until_ns = 0
         self._is_held = False

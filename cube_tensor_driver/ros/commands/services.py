@@ -136,11 +136,11 @@ def read_parameters(name: str, parameter: str | None) -> dict[str, Any]:
     """
     with run_node_session("parameters") as session:
         parameters = _NodeParameters(session, name)
-        names = parameters.names()
+        names = parameters.list_names()
         if parameter is not None:
             parameters.check_name(parameter)
             names = [parameter]
-        return parameters.values(names)
+        return parameters.read_values(names)
 
 
 def set_parameter(name: str, parameter: str, text: str) -> Any:
@@ -161,7 +161,7 @@ def set_parameter(name: str, parameter: str, text: str) -> Any:
         parameters = _NodeParameters(session, name)
         parameters.check_name(parameter)
         parameters.set(parameter, text)
-        return parameters.values([parameter])[parameter]
+        return parameters.read_values([parameter])[parameter]
 
 
 class _NodeParameters:
@@ -184,7 +184,7 @@ class _NodeParameters:
             others = ", ".join(nodes)
             raise ConfigError(f"no node {self._name} in {describe_domain()}; its nodes: {others}")
 
-    def names(self) -> list[str]:
+    def list_names(self) -> list[str]:
         """Return the sorted names of all parameters of the node."""
         answer = self._call(
             ListParameters,
@@ -202,13 +202,13 @@ class _NodeParameters:
         Raises:
             ConfigError: The node has no parameter of this name.
         """
-        names = self.names()
+        names = self.list_names()
         if parameter not in names:
             raise ConfigError(
                 f"{self._name} has no parameter {parameter}; it has: {', '.join(names)}"
             )
 
-    def values(self, names: list[str]) -> dict[str, Any]:
+    def read_values(self, names: list[str]) -> dict[str, Any]:
         """Return the values of the parameters with these names."""
         request = GetParameters.Request(names=names)
         answer = self._call(GetParameters, "get_parameters", request)
@@ -226,7 +226,7 @@ class _NodeParameters:
             ConfigError: The value has the wrong type, or the node refuses it.
         """
         value = get_parameter_value(text)
-        kind = type(self.values([parameter])[parameter])
+        kind = type(self.read_values([parameter])[parameter])
         # rclpy refuses an integer for a parameter of type double, but users write 2 for 2.0.
         if kind is float and value.type == ParameterType.PARAMETER_INTEGER:
             value = ParameterValue(

@@ -145,7 +145,7 @@ class LegendPlace(NamedTuple):
             low[2],
         )
 
-    def point(self, across: float, line: float) -> Array:
+    def compute_point(self, across: float, line: float) -> Array:
         """Return a point of the legend in the parent frame of the skin, (3,), in m.
 
         Args:
@@ -202,7 +202,7 @@ def draw_legend(
     low = -top if quantity.signed else 0.0
     edges_and_centres = np.linspace(0, 1, 2 * BAR_BOXES + 1)
     centres = edges_and_centres[1::2]
-    boxes = np.array([place.point(across, 0) for across in centres])
+    boxes = np.array([place.compute_point(across, 0) for across in centres])
     boxes[:, 1] += 0.15 * place.pitch
     values = np.linspace(low, top, BAR_BOXES)
     bar = Shape(
@@ -220,7 +220,7 @@ def draw_legend(
         value = (low + position * (top - low)) / quantity.size
         sign = "-" if value < 0 else "+" if quantity.signed else ""
         text = sign + format_in_four_characters(abs(value))
-        centre = place.point(position, NUMBERS_LINE)
+        centre = place.compute_point(position, NUMBERS_LINE)
         shapes.append(
             make_text(
                 f"legend number {number}",
@@ -234,7 +234,7 @@ def draw_legend(
     longest = (ranges.traction, ranges.gradient)
     for number, (scale, value) in enumerate(zip(SCALES, longest, strict=True)):
         line = FIRST_SCALE_LINE + SCALE_LINES * number
-        tail = place.point(0, line)
+        tail = place.compute_point(0, line)
         tip = tail + np.array([scale.length * place.pitch, 0, 0])
         arrow = np.stack([tail, tip])[np.newaxis]
         shapes.append(
@@ -250,7 +250,7 @@ def draw_legend(
         # The text begins to the right of the longest arrow. The position of a text marker is the
         # centre of the text. To compute it, letters are assumed to be half as wide as high.
         begin = (TRACTION_LENGTH + 0.3) * place.pitch / place.width
-        centre = place.point(begin + 0.25 * len(text) * TEXT_HEIGHT, line)
+        centre = place.compute_point(begin + 0.25 * len(text) * TEXT_HEIGHT, line)
         shapes.append(make_text(f"{scale.name} scale", text, height, centre))
 
     title = _make_title(quantity, top, health)
@@ -260,7 +260,7 @@ def draw_legend(
             "legend",
             title,
             height,
-            place.point(0.5, TITLE_LINE),
+            place.compute_point(0.5, TITLE_LINE),
         ),
     ]
 

@@ -57,7 +57,7 @@ class Driver(CubeNode):
     def configure(self) -> None:
         skin = self._skin = self.read_skin()
         self._pipeline = Pipeline([cube.calibration for cube in skin.cubes])
-        rate_hz = self._rate()
+        rate_hz = self._choose_rate()
         self._frequencies = FrequenciesPublisher(
             self,
             skin.parent_frame,
@@ -99,9 +99,9 @@ class Driver(CubeNode):
         The depth of the topics' queues, which follows from the sampling rate, is not changed: that
         would need new publishers.
         """
-        self._links.set_rate(self._rate())
+        self._links.set_rate(self._choose_rate())
 
-    def _rate(self) -> float | None:
+    def _choose_rate(self) -> float | None:
         """Return the sampling rate, in Hz, that hubs are asked for; None: each hub chooses one."""
         return float(self.read_value("rate")) or self._skin.rate
 
@@ -191,14 +191,14 @@ class FrequenciesPublisher:
         if self._next is None:
             return
         if self._always or self._publisher.get_subscription_count():
-            self._publisher.publish(self._next.data())
+            self._publisher.publish(self._next.encode())
 
     def _make_buffer(
         self,
         n_rows: int,
         n_pads: int,
     ) -> MessageBuffer[FrequencyRows]:
-        return frequency_codec.buffer(self._frame_id, n_rows, n_pads)
+        return frequency_codec.make_buffer(self._frame_id, n_rows, n_pads)
 
 
 def main() -> None:

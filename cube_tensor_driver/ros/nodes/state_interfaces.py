@@ -126,7 +126,7 @@ class SkinWrenches:
         self._wrench[is_lost] = np.nan
         return bool(is_lost.any())
 
-    def values(self) -> Array:
+    def compute_wrenches(self) -> Array:
         """Return the wrenches of all cubes and of the skin, (cubes + 1, 6).
 
         The rows are in the order of `names`, and the columns in the order of `COMPONENTS`.
@@ -255,6 +255,6 @@ class StateInterfaces:
     def _send(self, stamp_ns: int) -> None:
         stamp = to_time(stamp_ns)
         self._values.header = Header(stamp=stamp, frame_id=self._frame_id)
-        values: array[float] = pack_array("d", self._wrenches.values())
+        values: array[float] = pack_array("d", self._wrenches.compute_wrenches())
         self._values.values = values
         self._publisher.publish(self._values)

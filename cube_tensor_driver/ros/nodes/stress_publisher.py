@@ -78,7 +78,7 @@ class StressPublisher:
                 forces; None: the side of the cube itself.
             with_forces: Whether `forces` is published, too.
         """
-        self._buffer = lru_cache(maxsize=MAX_BUFFERS)(stress_codec.buffer)
+        self._buffer = lru_cache(maxsize=MAX_BUFFERS)(stress_codec.make_buffer)
         self._publisher = node.own(node.create_lifecycle_publisher(SkinStress, "stress", profile))
         forces = Forces(skin, side)
         self._cubes = CubeTopics(
@@ -118,7 +118,7 @@ class StressPublisher:
         stress = self._message.rows
         # The errors come first, so that nobody takes the stress for more certain than it is.
         self._errors.publish(stress, stamp_ns)
-        self._publisher.publish(self._message.data(stamp_ns))
+        self._publisher.publish(self._message.encode(stamp_ns))
         self._cubes.publish(stress)
         if self._forces is not None:
             self._forces.publish(stress, stamp_ns)

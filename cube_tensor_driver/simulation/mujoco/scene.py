@@ -19,7 +19,7 @@ import numpy as np
 
 from ...config.skin import Skin
 from ...core.errors import ConfigError
-from ..load import Resultant, StressField, total
+from ..load import Resultant, StressField, compute_resultant
 from .source import BodyContact, MujocoSkin, load_mujoco
 
 if TYPE_CHECKING:
@@ -130,19 +130,19 @@ class MujocoLoad:
         self._step = 0
         self._restart()
 
-    def at(self, seconds: float) -> StressField:
+    def compute_stress_field(self, seconds: float) -> StressField:
         """Compute stress and gradient at the cubes under the contacts at a time in s."""
         return self.touch.field(self._find_touches_at(seconds))
 
-    def total(self, seconds: float) -> Resultant:
+    def compute_resultant(self, seconds: float) -> Resultant:
         """Return total force, centre of pressure and mean normal of all contacts at a time in s."""
-        return total([touch.press for touch in self._find_touches_at(seconds)])
+        return compute_resultant([touch.press for touch in self._find_touches_at(seconds)])
 
     def _find_touches_at(self, seconds: float) -> list[BodyContact]:
         """Return the contacts at a time in s; the scene is computed up to it if necessary."""
         # A scene can only be computed forwards. Contacts at an earlier time are still in memory, or
         # the scene is computed again from its start.
-        number = self._step_number(seconds)
+        number = self._find_step_number(seconds)
         if number not in self._touches:
             if number < self._step:
                 self._restart()
@@ -150,7 +150,7 @@ class MujocoLoad:
                 self._advance()
         return self._touches[number]
 
-    def _step_number(self, seconds: float) -> int:
+    def _find_step_number(self, seconds: float) -> int:
         """Return the number of the last step of the scene before a time in s."""
         if self.repeats is not None:
             seconds %= self.repeats

@@ -186,7 +186,7 @@ class MujocoSkin:
         """Return the frequencies of all pads in the state of `data`, with its time as stamp."""
         stress, gradient = self.field(self.touches())
         self._scans += 1
-        return self._pads.rows(
+        return self._pads.compute_rows(
             stress,
             gradient,
             self._scans - 1,
@@ -507,7 +507,7 @@ def _compute_field_of_discs(
     # of each contact, both in the frame of the cube.
     place = (position[:, None] - centres) @ rotation
     force = forces @ rotation * facing[..., None]
-    return tables.field(place[..., :2], force, radii)
+    return tables.compute_field(place[..., :2], force, radii)
 
 
 def _compute_field_of_polygons(
@@ -548,7 +548,7 @@ def _compute_field_of_polygons(
     traction *= (facing > 0)[..., None]
     traction[..., 0] += twist * centre[..., 1]
     traction[..., 1] -= twist * centre[..., 0]
-    return tables.field(
+    return tables.compute_field(
         (starts - origin) @ in_plane,
         (ends - origin) @ in_plane,
         traction[:, number],

@@ -97,7 +97,7 @@ def make_discs(estimates: Sequence[ContactEstimate]) -> Discs:
     return Discs(forces, centres, log_squares / 2)
 
 
-def moment_polynomials(places: Array) -> Array:
+def compute_moment_polynomials(places: Array) -> Array:
     """Return 1, x, y, x^2, x y and y^2 (q, `N_MOMENTS`) at positions (q, 2).
 
     Their sums over the nodes of a contact, weighted with the forces, are the moments.
@@ -117,7 +117,7 @@ def estimate_contact(
     Args:
         centre: Position (2,) in m about which the moments are taken.
         moments: Sums (3, `N_MOMENTS`) of the forces along x, y and z of the nodes, times each of
-            `moment_polynomials`.
+            `compute_moment_polynomials`.
         root: Square root R (3, `N_MOMENTS`, k) of their covariance: with its first two axes joined,
             R R' is the covariance.
         size: Radius of a node in m.

@@ -109,7 +109,7 @@ def _distribute(
     for size in np.unique(sizes):
         of_this_size = np.flatnonzero(sizes == size)
         from_contacts = place[:, None] - contacts.places[of_this_size]
-        stress = inverse.contact_response.field(from_contacts.reshape(-1, 2), size)
+        stress = inverse.contact_response.compute_field(from_contacts.reshape(-1, 2), size)
         by_contact = -stress[:, zz].reshape(n_points, -1, 3)
         below[:, :, of_this_size] = by_contact.swapaxes(1, 2)
     below_by_force = below.reshape(n_points, -1)

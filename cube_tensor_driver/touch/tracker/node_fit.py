@@ -41,9 +41,9 @@ from .contact_estimate import (
     ContactEstimate,
     ContactSum,
     Discs,
+    compute_moment_polynomials,
     estimate_contact,
     make_discs,
-    moment_polynomials,
 )
 from .local_values import LocalValues, unroll_points
 from .pressure_regions import split_peaks
@@ -471,7 +471,7 @@ class NodeFit:
             own = labels == label
             centre = self.places[own].mean(axis=0)
             polynomials = np.zeros((len(labels), N_MOMENTS))
-            polynomials[own] = moment_polynomials(self.places[own] - centre)
+            polynomials[own] = compute_moment_polynomials(self.places[own] - centre)
             moments_root = polynomials.T @ root
             columns = moments_root.reshape(3 * N_MOMENTS, -1).T
             triangle = np.asarray(np.linalg.qr(columns, mode="r"))

@@ -156,7 +156,7 @@ class LiveTable:
             width: Width of the terminal, in characters.
         """
         # Tension is positive in the stress tensor, so the pressure is −σzz.
-        pressure = np.nan_to_num(-self._component("zz"))
+        pressure = np.nan_to_num(-self._select_component("zz"))
         decayed_peak = self._peak * PEAK_DECAY
         highest = float(pressure.max())
         self._peak = max(decayed_peak, highest, MIN_PEAK)
@@ -211,7 +211,7 @@ class LiveTable:
             PRESSURE: [Text("█" * int(bar_lengths[cube]), "blue") for cube in shown],
         }
         for name in SHOWN:
-            values = self._component(name)
+            values = self._select_component(name)
             if np.isfinite(values).any():
                 size, unit = find_component_unit(name)
                 stress, _, axis = name.partition("_")
@@ -227,7 +227,7 @@ class LiveTable:
             ".2f",
         )
         columns["Hz"] = _format_numbers(self._rate, shown, "4.0f")
-        columns["state"] = [self._state(cube) for cube in shown]
+        columns["state"] = [self._format_state(cube) for cube in shown]
         return columns
 
     def _make_table(self, columns: Mapping[str, Cells], has_lines: bool) -> Table:
@@ -254,11 +254,11 @@ class LiveTable:
             table.add_row(*cells)
         return table
 
-    def _component(self, name: str) -> Array:
+    def _select_component(self, name: str) -> Array:
         """Return the values (N,) of one component of all cubes, in Pa or Pa/m."""
         return self._latest.values[:, COMPONENTS.index(name)]
 
-    def _state(self, number: int) -> Text:
+    def _format_state(self, number: int) -> Text:
         """Return the names of the status bits that are set in the latest row of a cube.
 
         The text is "ok" if no bit is set, and "waiting" if no row has arrived yet.
