@@ -8,13 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from cube_tensor_driver.core.calibration import Calibration, illustrative
+from cube_tensor_driver.core.calibration import Calibration, make_illustrative_calibration
 from cube_tensor_driver.core.layout import Layout
 
 
 def with_dummy(layout_name: str, **changes) -> Calibration:
     """The illustrative calibration with one pad more, the last one."""
-    plain = illustrative(layout_name)
+    plain = make_illustrative_calibration(layout_name)
     own = plain.layout
     positions, normals = (np.vstack([rows, np.zeros(3)]) for rows in (own.positions, own.normals))
     one_more = {

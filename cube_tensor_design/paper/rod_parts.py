@@ -164,7 +164,8 @@ def split_signals(
     Args:
         bench: A linear bench with the cube.
         step: A step with a bonded bottom.
-        signals: (dofs,) weights of the nodal forces on the cube, from `VirtualBench.compute_pad_weights`.
+        signals: (dofs,) weights of the nodal forces on the cube, from
+            `VirtualBench.compute_pad_weights`.
         held: Quantity of the rod that the cube does not change.
     """
     if bench.finite or step.sliding:

@@ -141,7 +141,7 @@ class BagSource:
         for messages, recorded_ns in self.bag.read_frequencies(self.topic):
             # The health is read before messages are divided, because the recorded stress was
             # decoded in the same groups.
-            health = self.recording.health.at(messages.rows) if use_health else None
+            health = self.recording.health.find(messages.rows) if use_health else None
             yield from self._divide(messages, recorded_ns, health, join)
 
     def _divide(

@@ -56,7 +56,7 @@ def summarise_cubes(bag: Bag, topic: str, n_cubes: int) -> Iterator[CubeSummary]
     """
     # The empty first part makes the concatenation below possible for a topic without messages.
     parts: list[list[Integers]] = [[np.empty(0, np.int64)] * 3]
-    parts += bag.columns(topic, frequency_codec, ("cube", "sequence"))
+    parts += bag.read_columns(topic, frequency_codec, ("cube", "sequence"))
     columns = zip(*parts, strict=True)
     stamp_ns, cube, sequence = map(np.concatenate, columns)
     for number in range(n_cubes):

@@ -144,7 +144,8 @@ class BagWriter:
         Args:
             topic: Name of the topic.
             msgtype: Type of its messages, such as ``std_msgs/msg/String``.
-            qos: Quality of service profiles that its publishers offer, as `describe_quality` returns them.
+            qos: Quality of service profiles that its publishers offer, as `describe_quality`
+                returns them.
 
         Raises:
             BagError: The message type is unknown, or writing to the disk failed.

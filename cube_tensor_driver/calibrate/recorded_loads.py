@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..bags.read import Bag
-from ..bags.read import read_stamp_ns as header_stamp_ns
+from ..bags.read import Bag, read_stamp_ns
 from ..bags.source import BagSource, open_bag
 from ..core.arrays import Array, Real, Single, Times
 from ..core.calibration import Calibration
@@ -229,7 +228,7 @@ def _read_reference(
     elif msgtype in (WRENCH_TYPE, TENSOR_TYPE):
         entries = bag.read_decoded({topic})
         messages: list[WrenchStamped | StressTensorStamped] = [message for _, message in entries]
-        stamps = [header_read_stamp_ns(message) for message in messages]
+        stamps = [read_stamp_ns(message) for message in messages]
         stamp_ns = np.array(stamps, np.int64)
         if msgtype == WRENCH_TYPE:
             rows = [_find_axes(message.wrench.force) for message in messages]

@@ -41,7 +41,7 @@ from ..core.calibration import Calibration
 from ..core.compensation.models import ThermalModel
 from ..core.compensation.thermal import START_KELVIN
 from ..core.errors import BagError, FitError
-from ..core.oscillator import pad_frequency
+from ..core.oscillator import compute_pad_frequency
 from ..messages.codec import SECOND
 from .block_means import BlockMeans, find_lags
 
@@ -202,7 +202,7 @@ def read_warming(
         base = bags[-1].calibrations[cube]
         rest = bags[-1].rest_frequency[cube, : base.layout.n_pads]
         base = replace(base, thermal=None, rest_frequency=rest)
-        parts = [bag.of_cube(cube) for bag in bags]
+        parts = [bag.select_cube(cube) for bag in bags]
         seconds, stress, temperature = (np.concatenate(each) for each in zip(*parts, strict=True))
         ends = np.cumsum([len(part[0]) for part in parts])
         rows_per_block = sum(bag.counts[cube].sum() for bag in bags) / max(len(seconds), 1)
@@ -305,7 +305,7 @@ def _solve(
     behind = each_behind.mean(axis=1)
     u = data.temperature - data.temperature[0] - behind
     columns = np.column_stack([*(u**d for d in range(degree + 1)), each_behind])
-    size = root_mean_square(slope)
+    size = compute_root_mean_square(slope)
     weight = 1 / np.hypot(data.noise, LAG_ERROR * size * behind)
     weighted = columns * weight[:, None]
     normal = weighted.T @ weighted

@@ -19,7 +19,14 @@ import threading
 from collections.abc import Sequence
 
 from ..processes.stop_signals import INTERRUPTED
-from .parser import Parser, check_outputs, columns, make_formatter, make_sentence, suggest_nearest
+from .parser import (
+    Parser,
+    check_outputs,
+    find_help_width,
+    make_formatter,
+    make_sentence,
+    suggest_nearest,
+)
 from .table import COMMANDS, GROUPS, PACKAGES
 
 PROGRAM = "./cube"

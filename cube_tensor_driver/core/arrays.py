@@ -39,7 +39,7 @@ Numbers = TypeVar("Numbers", Single, Array, Real)
 """Array of real numbers of one precision."""
 
 
-def pad_table(
+def stack_pad_table(
     values: Sequence[Array | Mask],
     n_pads: int,
     fill: float,

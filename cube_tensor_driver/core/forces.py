@@ -85,8 +85,8 @@ class Forces:
         in_cube_frame = compute_face_force(rows.stress, side)
         force: Array = np.einsum("nij,nj->ni", rotation, in_cube_frame)
         traction = rows.stress[:, TRACTION_COMPONENTS]
-        # `compute_face_force` counts unknown components of the traction as 0. If all three are unknown, a
-        # force of 0 would claim that nothing presses.
+        # `compute_face_force` counts unknown components of the traction as 0. If all three are
+        # unknown, a force of 0 would claim that nothing presses.
         is_unobserved = np.isnan(traction).all(axis=1)
         force[is_unobserved] = np.nan
         return force

@@ -114,8 +114,8 @@ class LatestStress:
         """Return the latest components (N, 15), in Pa and Pa/m.
 
         Args:
-            health: Health of the cubes (N,), as `compute_health` returns it. Cubes that are `FAULTY` or
-                `STALE` get NaN.
+            health: Health of the cubes (N,), as `compute_health` returns it. Cubes that are
+                `FAULTY` or `STALE` get NaN.
         """
         is_usable: Mask = health < FAULTY
         return np.where(is_usable[:, None], self.values, np.nan)

@@ -70,7 +70,7 @@ def compute_pad_frequency(
     beta: Real,
     modulus: Real,
 ) -> Array:
-    """Compute the frequencies of pads, in Hz, from their stresses; the inverse of `compute_pad_stress`.
+    """Compute the frequencies of pads, in Hz, from their stresses: `compute_pad_stress` inverted.
 
     Args:
         stress: Normal stress on a pad, in Pa, tension positive.

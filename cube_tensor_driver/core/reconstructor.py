@@ -249,7 +249,7 @@ class Reconstructor:
         # like a pressure from all sides, unless the cube has a dummy pad.
         drift = np.hypot(self._drift.deviation, self._stated_drift)[cubes, None]
         on_pads = np.dstack(
-            [self.compensation.pad_errors(cubes), drift * self._stress_per_drift[cubes]]
+            [self.compensation.compute_pad_errors(cubes), drift * self._stress_per_drift[cubes]]
         )
         matrices = np.zeros((len(cubes), len(COMPONENTS), on_pads.shape[1]))
         chosen = zip(cubes.tolist(), left_out.tolist(), strict=True)

@@ -201,7 +201,7 @@ def rpy_from_quaternion(quaternion: ArrayLike) -> Array:
     return np.array(angles)
 
 
-def face_force(stress: Real, side: Array | float) -> Real:
+def compute_face_force(stress: Real, side: Array | float) -> Real:
     """Compute the force w^2 sigma n on a square whose normal n is +z.
 
     Args:

@@ -294,7 +294,7 @@ class LoadVerification:
         return compute_skin_components(self._skin, *self.load.compute_stress_field(seconds))
 
 
-def rms(values: Real) -> float:
+def compute_rms(values: Real) -> float:
     """Return the root mean square of all values that are not NaN."""
     return float(np.sqrt(np.nanmean(values**2)))
 

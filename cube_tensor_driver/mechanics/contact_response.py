@@ -67,8 +67,8 @@ class ContactResponse:
         if cubes.spectra is not cubes.point_spectra:
             self._response = self._tabulate_discs(cubes.spectra, bessel)
 
-        # For `compute_response_to_forces` and `compute_sensitivity`, the tables are matrices with one
-        # row for each pair of a radius and a distance.
+        # For `compute_response_to_forces` and `compute_sensitivity`, the tables are matrices with
+        # one row for each pair of a radius and a distance.
         width = 3 * len(self._order)
         rows = self._response.reshape(-1, width)
         self._rows = rows.astype(np.float32)

@@ -23,8 +23,8 @@ MAX_DOMAIN = 232
 """Largest number of a DDS domain. The UDP ports of larger ones would exceed 65535."""
 
 MAX_OWN_DOMAIN = 100
-"""Largest number of a DDS domain that `use_own_domain` chooses. Linux assigns the UDP ports of higher
-domains (from 32768 up) to any program that asks for a free port."""
+"""Largest number of a DDS domain that `use_own_domain` chooses. Linux assigns the UDP ports of
+higher domains (from 32768 up) to any program that asks for a free port."""
 
 FIRST_PORT = 7400
 """First UDP port of DDS domain 0 (DDSI-RTPS 2.2, section 9.6.2)."""

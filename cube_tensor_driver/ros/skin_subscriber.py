@@ -230,7 +230,7 @@ class SkinSubscriberNode(CubeNode):
                 return
             # A timer also publishes when no message arrives, so that cubes become stale.
             now_s = skin.arrived_s if is_followed else subscriber.now()
-            health = skin.newest.health(now_s, STALE_S)
+            health = skin.newest.compute_health(now_s, STALE_S)
             message = compute(skin, health)
             if message is not None:
                 publisher.publish(message)

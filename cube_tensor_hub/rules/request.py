@@ -57,7 +57,8 @@ def check_acks(transcript: Transcript) -> RuleResult:
         answered = [ack.request for ack in step.acks]
         if answered != asked:
             return report_failed(
-                f"requests {format_numbers(asked)} got ACKs {format_numbers(answered)}, in the step '{step.name}'"
+                f"requests {format_numbers(asked)} got ACKs {format_numbers(answered)}, "
+                f"in the step '{step.name}'"
             )
     # A STOP that was carried out before its ACK leaves no sample behind it.
     for name in ("stop", "stop samples"):

@@ -40,7 +40,7 @@ def bag(tmp_path_factory):
 @pytest.fixture(scope="module")
 def frequencies(bag):
     with ctd.open_bag(bag) as source:
-        return ctd.frequency_table(source)
+        return ctd.read_frequency_table(source)
 
 
 def assert_same(found: pyarrow.Table, expected: pyarrow.Table) -> None:
@@ -65,7 +65,7 @@ def test_a_whole_bag_gives_the_values_of_reprocess(bag, tmp_path, form):
     """Rest frequencies and pads left out as recorded, also after engines that use pandas."""
     path = KEPT if form == "kept" else bag
     with ctd.open_bag(path) as source:
-        table, skin = ctd.frequency_table(source), source.skin
+        table, skin = ctd.read_frequency_table(source), source.skin
     if form == "pandas":
         pytest.importorskip("pandas", reason="needs pandas: pip install pandas")
         table = pyarrow.Table.from_pandas(table.to_pandas())
@@ -94,7 +94,7 @@ def test_frequencies_alone_are_those_of_a_node_that_starts(bag, frequencies, tmp
     [
         (
             lambda table: table.drop_columns("stamp_ns"),
-            "no stamp_ns in the table; frequency_table makes",
+            "no stamp_ns in the table; read_frequency_table makes",
         ),
         (lambda table: table.drop_columns("part"), "keep the column part"),
         (

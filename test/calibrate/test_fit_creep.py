@@ -183,7 +183,7 @@ def test_three_commands_lead_from_a_bag_to_a_calibration(tmp_path, capsys, base)
     bag, saved = tmp_path / "press", tmp_path / "mine.yaml"
     with BagWriter(bag) as writer:
         for name, kind in {"info": INFO, "frequencies": FREQUENCIES}.items():
-            writer.add_topic(f"/{name}", kind, [quality(latched=name == "info")])
+            writer.add_topic(f"/{name}", kind, [describe_quality(latched=name == "info")])
         info = info_of(skin, Pipeline([base]), START_NS)
         writer.write("/info", START_NS, bytes(make_typestore().serialize_cdr(info, INFO)))
         for n, pads in enumerate(frequency.astype(np.float32)):

@@ -79,7 +79,7 @@ def make_bag(folder, knots, faces="both", seconds=600.0, measured=True, base=CUB
     store = make_typestore()
     with BagWriter(folder) as writer:
         for topic, kind in (("info", INFO), ("frequencies", FREQUENCIES)):
-            writer.add_topic(f"/{topic}", kind, [quality(latched=topic == "info")])
+            writer.add_topic(f"/{topic}", kind, [describe_quality(latched=topic == "info")])
         info = info_of(skin, Pipeline([base] * N_CUBES), START_NS)
         writer.write("/info", START_NS, bytes(store.serialize_cdr(info, INFO)))
         times = np.arange(0.0, seconds, 0.5)

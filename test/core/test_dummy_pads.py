@@ -11,24 +11,24 @@ import pytest
 from dummy_pad import with_dummy
 
 from conftest import stamped
-from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.calibration import make_illustrative_calibration
 from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.layout import Layout
-from cube_tensor_driver.core.oscillator import pad_frequency
+from cube_tensor_driver.core.oscillator import compute_pad_frequency
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.core.symmetry import find_structure
 from cube_tensor_driver.simulation.cubes import PadErrors, SimulatedCubes
 
 DRIFT = 3e-4
-PLAIN = replace(illustrative("cube"), drift=DRIFT)
+PLAIN = replace(make_illustrative_calibration("cube"), drift=DRIFT)
 DUMMY = with_dummy("cube", drift=DRIFT)
 
 
 @pytest.mark.parametrize("layout", ["quad", "planar", "cube"])
 @pytest.mark.parametrize("symmetry", ["slab", "mirrors"])
 def test_a_dummy_pad_changes_no_coefficient(layout, symmetry):
-    plain, dummy = illustrative(layout), with_dummy(layout)
+    plain, dummy = make_illustrative_calibration(layout), with_dummy(layout)
     assert dummy.layout.pads == (*plain.layout.pads, "dummy")
     structures = [find_structure(one.layout, symmetry) for one in (plain, dummy)]
     assert structures[0].names == structures[1].names
@@ -67,14 +67,14 @@ def errors_of(calibration, pressure, n=400):
     """Mean error (15,) of a simulated cube whose pads have drifted by 300 ppm, and its scatter."""
     cubes = SimulatedCubes([calibration], PadErrors(None, drift=DRIFT), seed=2)
     stress = np.array([[-pressure, -pressure, -pressure, 0, 0, 0]])
-    frequency = [cubes.frequency(stress, np.zeros((1, 6, 3)), 1.0)[0] for _ in range(n)]
-    rows = FrequencyRows.of(
+    frequency = [cubes.compute_frequency(stress, np.zeros((1, 6, 3)), 1.0)[0] for _ in range(n)]
+    rows = FrequencyRows.from_values(
         np.zeros(n), 1e-3 * np.array(frequency), stamp_ns=10_000_000 * np.arange(1, n + 1)
     )
     reconstruct = Reconstructor([calibration], np.float64)
     found = reconstruct(rows)
     error = np.hstack([found.stress - stress, found.gradient])
-    return error.mean(axis=0), error.std(axis=0), reconstruct.covariance(0), found
+    return error.mean(axis=0), error.std(axis=0), reconstruct.compute_covariance(0), found
 
 
 def test_a_dummy_pad_separates_drift_from_pressure():
@@ -96,7 +96,7 @@ def test_a_dummy_pad_separates_drift_from_pressure():
     # The mean error falls by noise² / (noise² + deviation²), below the error of the mean here.
     assert np.abs(error[:3]).max() < 4 * scatter[0] / np.sqrt(400)
     factor = noise**2 / (noise**2 + deviation**2)
-    exact = Reconstructor([DUMMY], np.float64).pipeline.matrix(0) @ np.full(25, deviation)
+    exact = Reconstructor([DUMMY], np.float64).pipeline.find_matrix(0) @ np.full(25, deviation)
     np.testing.assert_allclose(exact[:3], gain * deviation * factor, rtol=1e-6)
     assert found.residual.mean() == pytest.approx(1, abs=0.1)
 
@@ -114,9 +114,15 @@ def test_without_the_dummy_pad_the_drift_is_pressure_again():
     reconstruct = Reconstructor([DUMMY] * 2, np.float64)
     found = reconstruct(stamped(np.arange(2), f, 0, 0))
     assert np.abs(found.stress[0, :3]).max() < 0.2 and np.abs(found.stress[1, :3]).min() > 120
-    covariances = [reconstruct.covariance(0)[2, 2], reconstruct.covariance(1, 1 << 24)[2, 2]]
+    covariances = [
+        reconstruct.compute_covariance(0)[2, 2],
+        reconstruct.compute_covariance(1, 1 << 24)[2, 2],
+    ]
     assert np.sqrt(covariances[0]) < 5 and np.sqrt(covariances[1]) > 120
-    assert reconstruct.has_errors and not Reconstructor([illustrative("cube")]).has_errors
+    assert (
+        reconstruct.has_errors
+        and not Reconstructor([make_illustrative_calibration("cube")]).has_errors
+    )
 
 
 def test_a_dummy_pad_is_not_called_stuck_or_drifting():
@@ -128,7 +134,7 @@ def test_a_dummy_pad_is_not_called_stuck_or_drifting():
         reconstruct = Reconstructor([DUMMY])
         for time in np.arange(0.0, end, 0.01).tolist():
             v = size(time) * response @ state
-            f = pad_frequency(v, rest, DUMMY.beta, DUMMY.modulus)
+            f = compute_pad_frequency(v, rest, DUMMY.beta, DUMMY.modulus)
             f[:-1] *= 1 + 8e-6 * random.standard_normal(24)
             reconstruct(stamped(np.zeros(1, np.uint16), f[None], 0, round(1e9 * time)))
         assert not reconstruct.health.state[0, -1]

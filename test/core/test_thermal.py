@@ -86,7 +86,7 @@ def test_each_pad_has_its_own_mixture_of_filters():
     outputs = np.column_stack([reading(UNEVEN, [lag]) for lag in lags])
     measured = np.interp(UNEVEN, *KNOTS) - 25
     stress = np.outer(outputs.mean(axis=1), LINEAR) + (measured[:, None] - outputs) @ lagging.T
-    hertz = pad_frequency(stress, one.rest_frequency, one.beta, one.modulus)
+    hertz = compute_pad_frequency(stress, one.rest_frequency, one.beta, one.modulus)
     rows = replace(unloaded(UNEVEN, lags), frequency=hertz)
     found = Reconstructor([one, calibration([50.0])], np.float64).process(rows).stress
     np.testing.assert_allclose(found[:, [0, 2, 4]], 0, atol=2e-3)

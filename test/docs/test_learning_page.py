@@ -87,7 +87,7 @@ def test_program_runs_on_ray(page, tmp_path, monkeypatch):
         tables = []
         for name in BAGS:
             with ctd.open_bag(name) as source:
-                tables.append(ctd.frequency_table(source))
+                tables.append(ctd.read_frequency_table(source))
         blocks_of_bags = ray.data.from_arrow(tables).map_batches(
             ctd.reprocess_table,
             batch_size=None,

@@ -31,7 +31,7 @@ from cube_tensor_driver.config.influence import find_influence
 from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import Elastomer, Skin, read_skin
 from cube_tensor_driver.config.yaml import write_yaml
-from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.calibration import make_illustrative_calibration
 from cube_tensor_driver.core.compensation.models import WeightModel
 from cube_tensor_driver.core.defaults import FREQUENCY_NOISE
 from cube_tensor_driver.core.errors import ConfigError
@@ -71,7 +71,7 @@ ELASTOMER = Elastomer(depth=5e-3, thickness=np.inf, poisson=0.46)
 def write_heavy_skin(folder: Path) -> Path:
     """The file of a skin whose calibration states the response to its weight."""
     weight = WeightModel(read_weight("cube_11mm", 24))
-    heavy = replace(illustrative("cube"), weight=weight)
+    heavy = replace(make_illustrative_calibration("cube"), weight=weight)
     (folder / "heavy.yaml").write_text(format_calibration(heavy))
     skin = describe_grid(
         nx=SIDE, ny=SIDE, pitch=PITCH, rate=100.0, layout="cube", calibration="heavy.yaml"
@@ -92,7 +92,7 @@ def frequencies(skin: Skin, force: np.ndarray, centre: np.ndarray) -> np.ndarray
     state = calibration.modes.compute_state(to_matrix(stress), calibration.half_side * gradient)
     pads = state @ calibration.response.T
     rest, beta = calibration.rest_frequency, calibration.beta
-    return pad_frequency(pads, rest, beta, calibration.modulus)
+    return compute_pad_frequency(pads, rest, beta, calibration.modulus)
 
 
 def read_stamp_ns(data: bytes) -> int:
@@ -180,8 +180,8 @@ def test_pads_in_a_thin_layer_out_of_a_bag(tmp_path, one_process):
     described = make_info_message(skin, Pipeline(skin.calibrations), time.time_ns())
     described.sender = "reconstruction"
     info = serialize_message(described)
-    hertz = pad_frequency(np.array(pads), *law)
-    rows = FrequencyRows.of(np.arange(len(hertz)), hertz, stamp_ns=time.time_ns())
+    hertz = compute_pad_frequency(np.array(pads), *law)
+    rows = FrequencyRows.from_values(np.arange(len(hertz)), hertz, stamp_ns=time.time_ns())
     recorded = {"info": [info], "frequencies": [encoded(rows, FRAME)]}
     bag = write_bag(tmp_path / "bag", recorded)
     forces = []
@@ -277,7 +277,7 @@ def test_contacts_of_an_uncertain_compensation_live_and_out_of_a_bag(ros, tmp_pa
         nonlocal now_ns
         now_ns += step_ns
         noise = FREQUENCY_NOISE * random.standard_normal(hertz.shape)
-        rows = FrequencyRows.of(np.arange(n), hertz * (1 + noise), stamp_ns=now_ns)
+        rows = FrequencyRows.from_values(np.arange(n), hertz * (1 + noise), stamp_ns=now_ns)
         sent.append(encoded(rows, FRAME))
         publisher.publish(sent[-1])
 

@@ -90,7 +90,7 @@ class SentReadings:
         for cubes in members:
             self._index_on_hub[list(cubes)] = np.arange(len(cubes))
 
-    def of(self, cube: Integers, sample: Index) -> Readings:
+    def select(self, cube: Integers, sample: Index) -> Readings:
         """Return the readings of cubes (N,) in samples (N,)."""
         readings = self._readings[sample]
         row, on_hub = np.arange(len(sample)), self._index_on_hub[cube]

@@ -160,8 +160,8 @@ class ContactWriter:
         """
         finder = self._finder
         time_s = stamp_ns * 1e-9
-        health = self._latest.health(time_s, STALE_S)
-        values = self._latest.usable_values(health)
+        health = self._latest.compute_health(time_s, STALE_S)
+        values = self._latest.select_usable_values(health)
         next_ns = find_next_due_ns(stamp_ns, self._due_ns, self._period_ns)
         if next_ns is not None:
             self._due_ns = next_ns

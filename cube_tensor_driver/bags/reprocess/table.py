@@ -115,10 +115,10 @@ def reprocess_table(
     """Compute the stress of one recording of one skin, from an Arrow table to an Arrow table.
 
     The result depends on the arguments only, so frameworks such as Ray or Dask can call this
-    function in any process. With a table of `read_frequency_table` and the skin of the bag, the values
-    equal those of `./cube reprocess` bit by bit. For a skin with other calibrations, leave out the
-    columns of recorded health and rest frequencies (frequencies without load): then faulty pads are
-    detected from the frequencies, and the rest frequencies are those of the skin.
+    function in any process. With a table of `read_frequency_table` and the skin of the bag, the
+    values equal those of `./cube reprocess` bit by bit. For a skin with other calibrations, leave
+    out the columns of recorded health and rest frequencies (frequencies without load): then faulty
+    pads are detected from the frequencies, and the rest frequencies are those of the skin.
 
     The table must be a whole recording in the order of time, because the stress of a row depends on
     the rows before it through the health of the pads, the last tare, creep and temperature lag. A
@@ -158,7 +158,7 @@ def reprocess_table(
         missing = REQUIRED - columns.keys()
         if missing:
             names = ", ".join(sorted(missing))
-            raise LayoutError(f"no {names} in the table; frequency_table makes one of a bag")
+            raise LayoutError(f"no {names} in the table; read_frequency_table makes one of a bag")
         cube = columns["cube"]
         if not pyarrow.types.is_dictionary(cube.type):
             cube = cube.dictionary_encode()

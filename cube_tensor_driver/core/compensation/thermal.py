@@ -75,7 +75,7 @@ class Thermal:
             if model is not None:
                 n_lags = len(model.lag)
                 in_series = model.lagging is None
-                own = filter_weights(lag[cube, :n_lags]) if in_series else 1 / n_lags
+                own = compute_filter_weights(lag[cube, :n_lags]) if in_series else 1 / n_lags
                 weight[cube, :n_lags] = own
         self._filters = LowPass(lag.T, weight.T[..., None])
         self._reference = tabulate(models, "reference", ())

@@ -14,7 +14,7 @@ from collections import deque
 
 import numpy as np
 
-from ..arrays import Index, Mask, Single, StatusBits, pad_table
+from ..arrays import Index, Mask, Single, StatusBits, stack_pad_table
 from ..calibration import tabulate_pads
 from ..kernel.contract import Columns, Tables
 from ..kernel.rows import find_impossible
@@ -86,7 +86,7 @@ class Health:
         exists = ~np.isnan(rest)
         self._conditions = Conditions(self.sums, exists)
         dummies = [calibration.layout.is_dummy for calibration in pipeline.calibrations]
-        is_dummy = pad_table(dummies, pipeline.n_pads, fill=0) > 0
+        is_dummy = stack_pad_table(dummies, pipeline.n_pads, fill=0) > 0
         self.diagnosis = PadDiagnosis(exists, is_dummy)
         self.high_residual = np.zeros(n_cubes, bool)
         self.history: deque[Window] = deque(maxlen=HISTORY_WINDOWS)

@@ -26,7 +26,7 @@ from ...core.reconstructor import Reconstructor
 from ...core.rows import FrequencyRows, StressRows
 from ...core.status import INVALID
 from ...core.stress_errors import StressErrors
-from ...core.tensor import contact_wrench
+from ...core.tensor import compute_contact_wrench
 from ...messages.codec import stress_codec
 from ...messages.point_cloud import make_cloud_message
 from ...msg import SkinStress, StressTensorStamped
@@ -265,8 +265,8 @@ class CubeTopics:
             self._tensors.publish(cube, message)
 
     def _publish_wrenches(self, rows: StressRows, listened: list[int]) -> None:
-        # `compute_contact_wrench` would compute the wrench 0 for an invalid row, which looks like the
-        # measurement of no load.
+        # `compute_contact_wrench` would compute the wrench 0 for an invalid row, which looks like
+        # the measurement of no load.
         is_listened = np.isin(rows.cube, listened)
         is_valid = rows.status & INVALID == 0
         chosen = np.flatnonzero(is_listened & is_valid)

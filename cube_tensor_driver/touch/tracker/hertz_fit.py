@@ -548,7 +548,7 @@ def _linearise_alike(
     # The factor is the same for all values, so it only scales the error that the next step finds.
     depth_errors = np.array([fit.depth_error for fit in fits])
     halfway = np.repeat(1 + depth_errors / 2, contacts * cubes)
-    sensitivity = response.sensitivity(
+    sensitivity = response.compute_sensitivity(
         positions / halfway[:, None],
         angles,
         all_sizes / halfway,

@@ -258,7 +258,7 @@ class NodeFit:
         """
         strength = np.abs(self.forces).max(axis=0)
         is_strong = strength > MIN_SENSITIVE_SHARE * strength.max()
-        sensitivity = self.values.sensitivity(
+        sensitivity = self.values.compute_sensitivity(
             self.places[is_strong],
             self.size,
             self.forces[:, is_strong],
