@@ -235,12 +235,12 @@ def fit_thermal(data: Warming) -> ThermalFit:
         )
     unweighted = _search(data, 1, np.zeros(data.stress.shape[1]))
     slopes = unweighted.model.coefficient[:, 0]
-    slope = root_mean_square(slopes)
+    slope = compute_root_mean_square(slopes)
     best = _search(data, 1, slopes)
     # In `best`, the weight of a block depends on the difference between its temperatures before and
     # after the low-pass filter. If these weights change the slope much, the data do not determine
     # it, and `_check` raises an error.
-    change = abs(root_mean_square(best.model.coefficient[:, 0]) / slope - 1)
+    change = abs(compute_root_mean_square(best.model.coefficient[:, 0]) / slope - 1)
 
     curved = _search(data, 2, slopes)
     if curved.misfit < best.misfit + np.log(MAX_DEGREE_RATIO):
@@ -347,7 +347,7 @@ def _solve(
         ramp=ramp,
         lagging=values[degree + 1 :].T,
     )
-    misfit = np.log(root_mean_square(weighted_residual)) - np.log(weight).mean()
+    misfit = np.log(compute_root_mean_square(weighted_residual)) - np.log(weight).mean()
     return ThermalFit(data, model, values[0], u, residual, float(misfit))
 
 

@@ -234,7 +234,7 @@ class RecordedWindows:
             for batch in pyarrow.ipc.open_stream(file):
                 self._frames[batch[NUMBER_COLUMN][0].as_py()] = batch
 
-    def of(self, picture: AnyArray) -> dict[str, AnyArray]:
+    def find(self, picture: AnyArray) -> dict[str, AnyArray]:
         """Return the window that was recorded with a picture.
 
         Args:
@@ -250,7 +250,7 @@ class RecordedWindows:
         return self.find_frame(read_frame_number(picture))
 
     def find_frame(self, number: int) -> dict[str, AnyArray]:
-        """Return the window that was stored under a frame number; result and errors as in `of`."""
+        """Return the window that was stored under a frame number; result and errors: see `find`."""
         if number not in self._frames:
             raise BagError(f"no window has the number {number}; name the folder of this data set")
         batch = self._frames[number]

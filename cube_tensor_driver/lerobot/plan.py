@@ -194,7 +194,7 @@ def plan_bag(path: Path, choices: Choices) -> BagPlan:
 
 def _read_samples(source: BagSource) -> Iterator[tuple[Times, Index]]:
     """Yield the stamps and cube indices of all samples of cubes that the skin has."""
-    for stamp_ns, cube in source.bag.columns(source.topic, frequency_codec, ("cube",)):
+    for stamp_ns, cube in source.bag.read_columns(source.topic, frequency_codec, ("cube",)):
         is_known = cube < len(source.skin.cubes)
         yield stamp_ns[is_known].astype(np.int64, copy=False), cube[is_known].astype(np.intp)
 
@@ -247,7 +247,7 @@ def _read_marks(bag: Bag, choices: Choices) -> tuple[list[int], list[str]]:
     """
     if choices.marks is None:
         return [], [choices.task]
-    topics = bag.topics(MARK_TYPE)
+    topics = bag.list_topics(MARK_TYPE)
     if choices.marks not in topics:
         names = ", ".join(topics) or "none"
         raise BagError(

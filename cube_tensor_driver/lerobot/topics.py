@@ -18,7 +18,7 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 
 from ..bags.metadata import make_typestore
-from ..bags.read import Bag, list_message_fields, stamp_ns
+from ..bags.read import Bag, list_message_fields, read_stamp_ns
 from ..core.arrays import Single, Times
 from ..core.errors import BagError
 from ..messages.types import PACKAGE
@@ -106,7 +106,7 @@ class Topic:
             files = []
             for end_ns in ends_ns:
                 newest = None
-                while following is not None and stamp_ns(following) < end_ns:
+                while following is not None and read_stamp_ns(following) < end_ns:
                     newest = following
                     _, following = next(messages, (0, None))
                 # Only the last image before the end is encoded, because encoding is slow.
@@ -142,7 +142,7 @@ class Topic:
                 numbers = _find_joint_numbers(message, f"{bag.path}: {self.name}")
             else:
                 numbers = _find_numbers(vars(message), "")
-            yield stamp_ns(message), numbers
+            yield read_stamp_ns(message), numbers
 
 
 def find_topics(paths: Sequence[Path], choices: Choices) -> dict[str, Topic]:

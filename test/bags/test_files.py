@@ -769,7 +769,7 @@ try:
     with Bag(Path(sys.argv[1])) as source, BagWriter(Path(sys.argv[2])) as writer:
         for one in source.connections:
             writer.add_topic(one.topic, one.msgtype)
-        for entry in source.entries():
+        for entry in source.read_entries():
             writer.write(entry.topic, entry.time_ns, entry.data)
             writer.flush()
 except BagError as error:

@@ -98,7 +98,7 @@ def test_windows_hold_the_bits_of_the_stress_and_a_pause_lengthens_one(tmp_path,
 
     expected = ctd.Reconstructor(skin)(rows).select(slice(0, 67 * cubes))
     recorded = RecordedWindows(tmp_path)
-    windows = [recorded.of(picture) for picture in pictures]
+    windows = [recorded.find(picture) for picture in pictures]
     assert [len(window[TACTILE]) for window in windows] == [2, 2, 60, 3]
     for name in WINDOW_COLUMNS:
         joined = np.concatenate([window[f"{TACTILE}.{name}"] for window in windows])
@@ -127,7 +127,7 @@ def test_live_windows_have_the_bits_of_the_export_of_the_same_run(tmp_path, monk
         rows = concatenate(list(recorded))
     pictures = record(tmp_path / "touch", monkeypatch, rows, [4, 29, 59])
     touch = RecordedWindows(tmp_path / "touch")
-    windows = [touch.of(picture) for picture in pictures]
+    windows = [touch.find(picture) for picture in pictures]
 
     assert main(["export", "lerobot", str(bag), "-o", str(tmp_path / "set"), "--fps", "30"]) == 0
     table = pyarrow.parquet.read_table(tmp_path / "set" / "data" / "chunk-000" / "file-000.parquet")
@@ -152,15 +152,15 @@ def test_a_frame_without_samples_has_an_empty_window(tmp_path, monkeypatch):
     pictures = []
     for clock_ns in (BEGIN_NS, BEGIN_NS + PERIOD_NS):
         monkeypatch.setattr(live_module.time, "time_ns", lambda now=clock_ns: now)
-        source.give(FrequencyRows.of(range(cubes), rest, stamp_ns=BEGIN_NS - 1))
+        source.give(FrequencyRows.from_values(range(cubes), rest, stamp_ns=BEGIN_NS - 1))
         pictures.append(live.take_next_picture(10.0))
     with pytest.raises(TimeoutError, match="no sample in 0"):
         live.take_next_picture(0.0)
     live.close()
     recorded = RecordedWindows(tmp_path)
-    counts = [recorded.of(picture)[f"{TACTILE}.count"].tolist() for picture in pictures]
+    counts = [recorded.find(picture)[f"{TACTILE}.count"].tolist() for picture in pictures]
     assert counts == [[2] * cubes, [0] * cubes]
-    assert np.isnan(recorded.of(pictures[1])[TACTILE]).all()
+    assert np.isnan(recorded.find(pictures[1])[TACTILE]).all()
 
 
 def test_an_error_of_the_links_is_raised(tmp_path):

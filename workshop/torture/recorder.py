@@ -158,7 +158,7 @@ class TopicLog(Generic[AnyRows]):
         cubes = np.unique(self.decode_newest_rows().cube)
         return len(cubes) == self._n_cubes
 
-    def received(self) -> Received[AnyRows]:
+    def collect_received(self) -> Received[AnyRows]:
         """Return the rows (one cube at one sampling time each) of all messages.
 
         Raises:
