@@ -138,7 +138,7 @@ class Person:
         self._back = np.swapaxes(turns, -1, -2)
         self.pressed: tuple[int, str] | None = None
 
-    def compute_effect(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+    def compute_stress_field(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
         """The half space under a sphere, in the frames of the turned cubes."""
         n = len(self._position)
         if self.pressed is None:

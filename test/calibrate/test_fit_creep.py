@@ -179,7 +179,9 @@ def test_three_commands_lead_from_a_bag_to_a_calibration(tmp_path, capsys, base)
     time = np.arange(0, 100, 0.1)
     frequency = measured(time, pressed(time, 5, 90), 0.1, base=base)
     cube = SimpleNamespace(name="c0", link="hub0", index=0, uid=0, calibration=base)
-    skin = SimpleNamespace(name="skin", elastomer=None, frame=lambda cube: cube.name, cubes=[cube])
+    skin = SimpleNamespace(
+        name="skin", elastomer=None, make_frame_id=lambda cube: cube.name, cubes=[cube]
+    )
     bag, saved = tmp_path / "press", tmp_path / "mine.yaml"
     with BagWriter(bag) as writer:
         for name, kind in {"info": INFO, "frequencies": FREQUENCIES}.items():

@@ -70,7 +70,7 @@ def make_bag(folder, knots, faces="both", seconds=600.0, measured=True, base=CUB
     skin = SimpleNamespace(
         name="skin",
         elastomer=None,
-        frame=lambda cube: cube.name,
+        make_frame_id=lambda cube: cube.name,
         cubes=[
             SimpleNamespace(name=name, link="hub0", index=k, uid=0, calibration=base)
             for k, name in enumerate(names)

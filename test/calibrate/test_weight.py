@@ -61,7 +61,7 @@ def make_bag(folder, poses=POSES, spread=0.0, cubes=3, motion=True, **changes):
     skin = SimpleNamespace(
         name="skin",
         elastomer=None,
-        frame=lambda cube: cube.name,
+        make_frame_id=lambda cube: cube.name,
         cubes=[
             SimpleNamespace(name=f"c{k}", link="hub0", index=k, uid=0, calibration=calibration)
             for k in range(cubes)
@@ -190,7 +190,7 @@ class Pressed:
         self.stress = np.zeros((cubes, 6))
         self.stress[:, 2] = zz
 
-    def compute_effect(self, seconds: float):
+    def compute_stress_field(self, seconds: float):
         return self.stress, np.zeros((len(self.stress), 6, 3))
 
 

@@ -112,7 +112,7 @@ def with_others(
     """A copy of a bag with changed messages, and with more: topic, time of recording, message."""
     store = make_typestore()
     with Bag(plain) as bag:
-        entries = list(bag.entries())
+        entries = list(bag.read_entries())
     entries = [(*one[:3], change(number, one)) for number, one in enumerate(entries)]
     for topic, time_ns, one in added:
         data = bytes(store.serialize_cdr(one, one.__msgtype__))
