@@ -213,8 +213,15 @@ def test_the_page_shows_a_load_a_cube_and_a_tare(ros, tmp_path, page):
         )
         clicked_ns = time.time_ns()
         press(page, "tare")
-        see(ros, page, lambda text: "tare done" in text or "tare refused" in text)
-        assert "tare done" in text(page), text(page)
+
+        def is_tared(text: str) -> bool:
+            # A busy machine interrupts the skin, and a tare over the gap is refused.
+            is_done = "tare done" in text
+            if not is_done and "gaps in it" in text:
+                press(page, "tare")
+            return is_done
+
+        see(ros, page, is_tared)
         see(ros, page, lambda text: abs(shown(text)) < 200)
         ros.wait(lambda: abs(newest(heard)) < 200)
         tared_ns = min(at for at, zz in rows(heard) if at > clicked_ns and abs(zz) < 200)
