@@ -151,9 +151,9 @@ def test_the_deviation_states_the_error_of_ramps(fitted, ramp):
             ]
             stated.append([np.diag(one)[:3] for one in grown])
     ratio = np.sqrt((np.array(errors) ** 2).mean(axis=(0, 1)) / np.mean(stated, axis=(0, 1)))
-    # Measured: 0.68 to 1.11 of "both"; of "ground" 0.18 to 0.41 (60 s, errors of at most 2 Pa) and
-    # 1.0 to 2.4 (900 s, 8 Pa).
-    assert (ratio > 0.15).all() and (ratio < (1.2 if faces == "both" else 2.5)).all()
+    # Measured: 0.57 to 0.79 of "both"; of "ground" 0.08 (60 s, errors of at most 2 Pa) and 0.43 to
+    # 0.48 (900 s, 8 Pa), where the unknown start is stated.
+    assert (ratio > (0.5 if faces == "both" else 0.06)).all() and (ratio < 0.9).all()
 
 
 @pytest.mark.parametrize("tared", [False, True])
@@ -264,7 +264,8 @@ WARM = ((30.0, 25.0), (60.0, 40.0))
         ({"measured": False}, None, "its rows state no temperature"),
         ({"knots": ((0.0, 25.0), (600.0, 26.0))}, None, "record while the skin warms or cools"),
         ({"seconds": 100.0}, None, "120 s and 3 K are needed"),
-        ({"seconds": 130.0, "faces": "ground"}, None, "until the skin is warm throughout"),
+        ({"seconds": 300.0, "faces": "ground"}, None, "9 % of the largest lag are left at the end"),
+        ({"knots": ((0.0, 25.0), (30.0, 40.0))}, None, "begin with half a minute at rest"),
         ({"seconds": 10.0}, "c9", "no cube 'c9'; there are c0, c1"),
     ],
 )
