@@ -40,6 +40,7 @@ class Parser(argparse.ArgumentParser):
     """An ArgumentParser with error messages of two lines, which suggest similar known words."""
 
     _subcommands: argparse._SubParsersAction[Parser] | None = None
+    # Whether all words are passed on (see `add_words`), and the error message if there is none.
     _passes_words = False
     _missing = ""
 

@@ -26,13 +26,14 @@ width of the skin (along x)."""
 
 
 class _Display(TypedDict):
-    """Keys of a display in RViz's file that are read or changed here."""
+    """Those keys of a display in RViz's file that are read or changed here."""
 
     Name: str
     Topic: dict[str, str]
 
 
 _Camera = TypedDict("_Camera", {"Focal Point": dict[str, float], "Distance": float})
+"""Those keys of the camera in RViz's file that are changed here."""
 _Manager = TypedDict(
     "_Manager",
     {
@@ -41,6 +42,7 @@ _Manager = TypedDict(
         "Views": dict[str, _Camera],
     },
 )
+"""Those parts of RViz's file that are changed here."""
 
 
 def make_rviz_view(skin: Skin) -> dict[str, object]:

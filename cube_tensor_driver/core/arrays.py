@@ -36,7 +36,7 @@ Records = NDArray[np.void]
 AnyArray = NDArray[np.generic]
 """Array whose type is not known here, or of no importance."""
 Numbers = TypeVar("Numbers", Single, Array, Real)
-"""Array of real numbers of one precision."""
+"""Array of real numbers; all arguments and the result of a function have the same precision."""
 
 
 def stack_pad_table(

@@ -67,6 +67,8 @@ def load_or_compute(
 
     arrays = _load(path)
     if arrays is not None:
+        # The name of the file contains a hash of the inputs and of the code, so that an earlier
+        # call of the same function has computed these arrays.
         return cast(Cached, arrays)
 
     computed = compute()

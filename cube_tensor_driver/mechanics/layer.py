@@ -42,6 +42,7 @@ MEASURED = [FIELD.index(name) for name in COMPONENTS]
 gradients of the normal stresses."""
 
 _Wave = NDArray[np.complexfloating]
+"""Complex amplitudes of one quantity in a wave, at several wavenumbers."""
 _WaveStress = dict[str, tuple[_Wave, _Wave]]
 """Stress under a wave of traction on the surface, and the derivative of this stress along z. A key
 such as "LzT" names the stress component Lz and the direction T of the traction, in the axes of the
