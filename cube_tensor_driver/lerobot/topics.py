@@ -71,6 +71,9 @@ class Topic:
             # Bags may contain different joints, so the feature gets the joints of all bags.
             for _, numbers in self._read_numbers(bag):
                 self.names |= dict.fromkeys(numbers)
+                # Messages of other types have the same numbers in every message.
+                if self.msgtype != JOINT_STATE_TYPE:
+                    return
         elif self.shape is None:
             for _, message in bag.read_decoded({self.name}):
                 _, self.shape = encode(message, f"{bag.path}: {self.name}")
