@@ -80,7 +80,7 @@ def export_lerobot(
             )
     depth = max(int(plan.counts.max()) for plan in plans)
     if not depth:
-        raise BagError(f"{bags[0]}: no sample lies between the marks; nothing to export")
+        raise BagError(f"{bags[0]}: no sample lies in an episode; record longer, or set marks")
     topics = find_topics(bags, choices)
     names = {key: list(topic.names) for key, topic in topics.items()}
     skin = plans[0].skin
