@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from pathlib import Path
-from queue import Empty, SimpleQueue
 
 import numpy as np
 import pyarrow
@@ -58,22 +58,26 @@ MIN_HEIGHT = 4 * MIN_SQUARE
 """Smallest height of a picture, in pixels, so that the frame number, which is two rows of squares
 (`NUMBER_GRID`), covers at most half of it."""
 
-MAX_ARRIVAL_MS = 250
-"""Longest time, in ms, by which a sample may arrive after a frame and still get into its window.
-Samples that arrive later get into the oldest window that has not been written.
+WRITING_DELAY_MS = 2000
+"""Time, in ms, from the reading of a frame to the writing of its window. Samples that arrive later
+get into the oldest window that has not been written.
 
-A sample passes through two threads, which a busy computer holds up.
+A busy computer holds up the threads that pass on samples. A live source drops samples that have
+waited longer than this (`QUEUE_S`).
 """
 
 UNKNOWN_GREY = 90
 """Brightness (0 to 255) of the cubes whose stress along z is unknown."""
+
+NO_ROWS = StressRows.of(np.empty(0, np.uint16), np.empty((0, 6)), np.empty((0, 9)))
+"""A table without rows, with which the list of the parts of a window begins."""
 
 
 class LiveWindows:
     """Writes the stress of a live skin to a file, one window for each frame.
 
     The window of a frame consists of the samples with stamps up to its frame number (a time) that
-    are in no earlier window. It is written `MAX_ARRIVAL_MS` later, so that samples that are still
+    are in no earlier window. It is written `WRITING_DELAY_MS` later, so that samples that are still
     on their way when the frame is read get into it. A thread collects samples as they arrive,
     whatever the recorder does meanwhile. Windows may differ in length, so a pause of the recorder
     makes only one window longer. The file is FOLDER/NUMBER.arrow, with the number of the first
@@ -117,12 +121,14 @@ class LiveWindows:
         self._cube_at = find_nearest_cubes(source.skin, width, height)
         self._writer: pyarrow.ipc.RecordBatchStreamWriter | None = None
         self._failure: CubeError | None = None
-        self._arrived: SimpleQueue[StressRows] = SimpleQueue()
         self._level = np.full(len(source.skin.cubes), np.nan)
+        self._arrived: deque[StressRows] = deque()
+        self._has_arrived = threading.Event()
         self._number = 0
-        # Numbers of the frames whose windows have not been written, and the rows for them.
+        # Numbers of the frames whose windows have not been written, and the parts of these windows.
+        # The last list of parts has the samples that are newer than all frames.
         self._unwritten: list[int] = []
-        self._rows: list[StressRows] = []
+        self._parts = [[NO_ROWS]]
         self._thread = threading.Thread(target=self._collect, daemon=True)
         self._thread.start()
 
@@ -141,17 +147,17 @@ class LiveWindows:
             TimeoutError: No sample arrived.
             CubeError: The thread that reads the links has failed.
         """
-        try:
-            self._rows.append(self._arrived.get(timeout=timeout_s))
-        except Empty:
+        if not self._has_arrived.wait(timeout_s):
             raise self._failure or TimeoutError(
                 f"skin {self._source.skin.name}: no sample in {timeout_s:g} s; check that the hubs "
                 "are connected and that no other program reads them"
-            ) from None
+            )
+        self._has_arrived.clear()
         # Frame numbers must rise, although the clock of the computer may be set back.
         self._number = max(self._number + 1, time.time_ns() // NUMBER_NS)
         self._unwritten.append(self._number)
-        self._write_windows(self._number - MAX_ARRIVAL_MS)
+        self._parts.append([NO_ROWS])
+        self._write_windows(self._number - WRITING_DELAY_MS)
         return self._make_picture()
 
     def close(self) -> None:
@@ -172,20 +178,20 @@ class LiveWindows:
                 rows = reconstruct(frequencies)
                 # Where a cube occurs repeatedly, numpy keeps the last value, which is the newest.
                 self._level[rows.cube] = -rows.stress[:, 2] / self._full_scale
-                self._arrived.put(rows)
+                self._arrived.append(rows)
+                self._has_arrived.set()
         except CubeError as error:
             self._failure = error
 
     def _write_windows(self, last: int) -> None:
-        """Write the windows of the frames up to the number `last` to the Arrow stream."""
-        while not self._arrived.empty():
-            self._rows.append(self._arrived.get())
+        """Put what has arrived into windows, and write those of the frames up to `last`."""
+        while self._arrived:
+            rows = self._arrived.popleft()
+            window = np.searchsorted(NUMBER_NS * np.array(self._unwritten), rows.stamp_ns)
+            for index in np.unique(window):
+                self._parts[index].append(rows.select(window == index))
         while self._unwritten and self._unwritten[0] <= last:
-            number = self._unwritten.pop(0)
-            rows = concatenate(self._rows)
-            is_inside = rows.stamp_ns <= NUMBER_NS * number
-            self._rows = [rows.select(~is_inside)]
-            rows = rows.select(is_inside)
+            number, rows = self._unwritten.pop(0), concatenate(self._parts.pop(0))
             # A window has at least one place for samples, even if it has no sample.
             depth = int(np.bincount(rows.cube, minlength=1).max(initial=1))
             first_frame = np.zeros(len(rows), np.intp)
