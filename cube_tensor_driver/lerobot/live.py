@@ -69,7 +69,7 @@ waited longer than this (`QUEUE_S`).
 UNKNOWN_GREY = 90
 """Brightness (0 to 255) of the cubes whose stress along z is unknown."""
 
-NO_ROWS = StressRows.of(np.empty(0, np.uint16), np.empty((0, 6)), np.empty((0, 9)))
+NO_ROWS = StressRows.from_values(np.empty(0, np.uint16), np.empty((0, 6)), np.empty((0, 9)))
 """A table without rows, with which the list of the parts of a window begins."""
 
 
