@@ -345,10 +345,10 @@ def make_mode_loads(solid: Solid, layout: Layout) -> Load:
     stress = modes.stress[np.ix_(numbers, axes, axes)]
     gradient = modes.gradient[np.ix_(numbers, axes, axes, axes)]
 
-    def field(x: Array) -> Array:
+    def compute_field(x: Array) -> Array:
         return stress + np.einsum("mijk,qk->qmij", gradient, x)
 
-    return make_outside_load(solid, field)
+    return make_outside_load(solid, compute_field)
 
 
 def make_outside_load(solid: Solid, field: Callable[[Array], Array]) -> Load:
@@ -397,9 +397,9 @@ def iterate_parities(
     """Yield the parities of a body and report each. Parities that share a factorisation of the
     stiffness matrix follow one another."""
 
-    def shared(parity: Parity) -> Parity:
+    def find_shared_axes(parity: Parity) -> Parity:
         return solid.sort_axes(parity)[0]
 
-    for parity in sorted(solid.parities, key=shared, reverse=True):
+    for parity in sorted(solid.parities, key=find_shared_axes, reverse=True):
         report("parity " + "".join("-0+"[sign + 1] for sign in parity))
         yield parity

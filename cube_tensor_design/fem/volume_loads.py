@@ -113,7 +113,7 @@ def compute_thermal_stress(
     n_held = 2 if layout.planar and body.plane == "stress" else 3
     expansions = body.expansion, body.cube_expansion
 
-    def load(solid: Solid) -> Load:
+    def make_load(solid: Solid) -> Load:
         parts = []
         for number, (lam, mu) in enumerate(solid.moduli):
             basis = solid.select_elements(in_cube=number == 1)
@@ -135,7 +135,7 @@ def compute_thermal_stress(
         # A field that depends on the height alone is even under each mirror.
         return lambda parity: [part * (min(parity) >= 0) for part in parts]
 
-    results = solve_meshes(body, layout, meshes, load, progress)
+    results = solve_meshes(body, layout, meshes, make_load, progress)
     finest = results[-1]
     return ThermalStress(
         body,
@@ -168,7 +168,7 @@ def compute_weight(
     axes = choose_field_axes(layout)
     densities = body.density, body.cube_density
 
-    def load(solid: Solid) -> Load:
+    def make_load(solid: Solid) -> Load:
         parts = []
         for number, density in enumerate(densities):
             elements = solid.select_elements(in_cube=number == 1)
@@ -186,7 +186,7 @@ def compute_weight(
 
         return select_parity
 
-    results = solve_meshes(body, layout, meshes, load, progress)
+    results = solve_meshes(body, layout, meshes, make_load, progress)
     pads = np.zeros((layout.n_pads, 3))
     # Lengths of the solid are in d0, so stress is force per volume times d0.
     pads[:, axes] = body.side / 2 * results[-1].pads

@@ -183,7 +183,7 @@ def make_plate_step(
         rod: Rod that presses in place of the top plate; None: the plate presses.
     """
 
-    def prescribed(x: Array) -> Array:
+    def prescribe(x: Array) -> Array:
         moved = np.full(x.shape, np.nan)
         bottom = x[1] < -body.height / 2 + 1e-9
         moved[1, bottom] = 0.0
@@ -197,7 +197,7 @@ def make_plate_step(
             moved[0, top] = 0.0
         return moved
 
-    return LoadStep(prescribed, rod, gripped, sliding=not bonded)
+    return LoadStep(prescribe, rod, gripped, sliding=not bonded)
 
 
 def make_dent_step(

@@ -373,7 +373,7 @@ class VirtualBench:
         found."""
         contact = self.make_rod_contact(task.rod) if task.rod else None
 
-        def tangent(u: Array) -> sp.csr_matrix:
+        def compute_tangent(u: Array) -> sp.csr_matrix:
             inner = self.section.compute_tangent(u)
             return inner if contact is None else inner + contact.compute_tangent(u)
 
@@ -386,7 +386,7 @@ class VirtualBench:
                 task.prescribed,
                 task.rows,
                 balance,
-                tangent,
+                compute_tangent,
                 linear,
             )
 

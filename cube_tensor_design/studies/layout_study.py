@@ -198,7 +198,7 @@ def _solve_box(
 
     known_fields: dict[bytes, Array] = {}
 
-    def field(x: Array) -> Array:
+    def compute_field(x: Array) -> Array:
         key = x.tobytes()
         if key not in known_fields:  # every parity asks for the same points
             stresses = [passage.compute_field(passage.side / 2 * x)[0] for passage in passages]
@@ -208,7 +208,7 @@ def _solve_box(
     # All parities are solved for the modes and for the passages.
     report = count_steps(progress, 2 * len(solid.parities))
     matrix = compute_pad_stresses(solid, layout, make_mode_loads(solid, layout), report)
-    pads = compute_pad_stresses(solid, layout, make_outside_load(solid, field), report)
+    pads = compute_pad_stresses(solid, layout, make_outside_load(solid, compute_field), report)
     report("done")
     return matrix, pads
 

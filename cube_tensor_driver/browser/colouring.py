@@ -53,7 +53,7 @@ class Colouring(NamedTuple):
             last_top: Upper end in the picture before, in SI units; an automatic range falls slowly
                 from it.
         """
-        cubes = quantity.of(scan.values, scan.residual)
+        cubes = quantity.compute(scan.values, scan.residual)
         # `surface.middle` contains, for each cube, the index of the point nearest to it.
         middle = scan.field.pressure[surface.middle]
         sigma = scan.field.sigma

@@ -30,7 +30,7 @@ DEVIATION = Quantity(
     size=1e3,
     min_top=QUANTITIES["pressure"].min_top,
     signed=False,
-    of=lambda values, residual: np.full(len(values), np.nan),
+    compute=lambda values, residual: np.full(len(values), np.nan),
 )
 """The standard deviation of the pressure on the surface, as a quantity for colours.
 

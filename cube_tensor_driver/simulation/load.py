@@ -417,10 +417,10 @@ def remember(load: Fields) -> Callable[[int], StressField]:
     field_bytes = sum(part.nbytes for part in load.compute_stress_field(0.0))
 
     @lru_cache(MAX_CACHED_BYTES // field_bytes)
-    def at(time_us: float) -> StressField:
+    def compute_at(time_us: float) -> StressField:
         return load.compute_stress_field(time_us * 1e-6)
 
-    return lambda time_us: at(time_us % period_us)
+    return lambda time_us: compute_at(time_us % period_us)
 
 
 def _choose_orders(

@@ -85,7 +85,7 @@ class Quantity:
         min_top: Minimum of the upper end of an automatic range, in SI units. It is so large that
             noise alone gets no strong colour.
         signed: Whether the range is symmetrical around zero; otherwise it begins at zero.
-        of: Function that computes the quantity (N,), in SI units, of N cubes from their values
+        compute: Function that computes the quantity (N,), in SI units, of N cubes from their values
             (N, 15), 6 stress components in Pa and 9 gradients in Pa/m, and residuals (N,).
     """
 
@@ -94,7 +94,7 @@ class Quantity:
     size: float
     min_top: float
     signed: bool
-    of: Callable[[Array, Array], Array]
+    compute: Callable[[Array, Array], Array]
 
 
 def _select_component(name: str) -> Callable[[Array, Array], Array]:
@@ -103,14 +103,14 @@ def _select_component(name: str) -> Callable[[Array, Array], Array]:
 
 
 def _make_magnitude(*names: str) -> Callable[[Array, Array], Array]:
-    """Return a function for `Quantity.of`: the magnitude of the vector of some components.
+    """Return a function for `Quantity.compute`: the magnitude of the vector of some components.
 
     Args:
         names: Names of the components of the vector, such as "yz" and "zx".
     """
     columns = [COMPONENTS.index(name) for name in names]
 
-    def of(values: Array, residual: Array) -> Array:
+    def compute(values: Array, residual: Array) -> Array:
         parts = values[:, columns]
         is_observed = np.isfinite(parts)
         # An unobserved component counts as 0; if all are unobserved, the magnitude is NaN.
@@ -118,12 +118,12 @@ def _make_magnitude(*names: str) -> Callable[[Array, Array], Array]:
         magnitude = np.linalg.norm(observed_parts, axis=1)
         return np.where(is_observed.any(axis=1), magnitude, np.nan)
 
-    return of
+    return compute
 
 
 def _make_stress_quantity(
     label: str,
-    of: Callable[[Array, Array], Array],
+    compute: Callable[[Array, Array], Array],
     signed: bool = False,
 ) -> Quantity:
     return Quantity(
@@ -132,7 +132,7 @@ def _make_stress_quantity(
         size=1e3,
         min_top=500.0,
         signed=signed,
-        of=of,
+        compute=compute,
     )
 
 
@@ -145,7 +145,7 @@ QUANTITIES = {
         size=1e6,
         min_top=1e5,
         signed=False,
-        of=_make_magnitude("zz_x", "zz_y"),
+        compute=_make_magnitude("zz_x", "zz_y"),
     ),
     **{
         name: _make_stress_quantity(
@@ -161,7 +161,7 @@ QUANTITIES = {
         size=1.0,
         min_top=3.0,
         signed=False,
-        of=lambda values, residual: residual,
+        compute=lambda values, residual: residual,
     ),
 }
 """Name -> quantity, for all quantities that markers (RViz) and the page can show in colours.
@@ -241,7 +241,7 @@ class Ranges(NamedTuple):
             self.traction,
         )
         gradient = QUANTITIES["gradient"]
-        magnitude = gradient.of(values, residual)
+        magnitude = gradient.compute(values, residual)
         longest_gradient = choose_automatic_top(
             gradient,
             magnitude,

@@ -161,17 +161,18 @@ def play(
 def _describe(actions: Actions, log: SampleLog) -> dict[str, Any]:
     """Return the figures of faults and actions."""
 
-    def seconds(time_ns: int) -> float:
+    def compute_seconds(time_ns: int) -> float:
         return round((time_ns - log.start_time_ns) / NS_PER_S, 3)
 
-    def span(action: NodeAction) -> str:
-        return f"{action.kind}: {seconds(action.begin_ns)} to {seconds(action.end_ns)} s"
+    def format_span(action: NodeAction) -> str:
+        begin_s, end_s = compute_seconds(action.begin_ns), compute_seconds(action.end_ns)
+        return f"{action.kind}: {begin_s} to {end_s} s"
 
     failed = [f"{action.kind}: {action.answer}" for action in actions.done if not action.succeeded]
     return {
         "faults": _count_sorted(record.fault.kind for record in log.faults),
         "actions": _count_sorted(action.kind for action in actions.done),
-        "timeline": [span(action) for action in actions.done],
+        "timeline": [format_span(action) for action in actions.done],
         # A tare that was refused because the host was too busy is no failure.
         "actions_failed": len(failed) - len(actions.refused),
         "failed": failed,

@@ -57,7 +57,7 @@ class Markers(SkinSubscriberNode):
     def compute_message(self, skin: FollowedSkin, health: Index) -> bytes:
         values = skin.newest.select_usable_values(health)
         residual = skin.newest.residual
-        shown = self._quantity.of(values, residual)
+        shown = self._quantity.compute(values, residual)
         fixed = float(self.read_value("range"))
         last = self._ranges.colours
         top = fixed or scene.choose_automatic_top(self._quantity, shown, last)
