@@ -217,9 +217,9 @@ def _compute_recovery_matrix(matrix: Array, name: str) -> Array:
     """Return the matrix (15, pads) from the pad stresses of a layout to `COMPONENTS`."""
     layout = LAYOUTS[name]
     modes = PLANE if layout.planar else SPACE
-    # A layout in a plane has plane modes only. `states` has the amplitudes of the modes in space
-    # that each mode of the layout stands for.
-    states = SPACE.compute_state(modes.stress, modes.gradient).T
-    response = matrix[: layout.n_pads] @ states
+    # A layout in a plane has plane modes only. `amplitudes` has those of the modes in
+    # space that each mode of the layout stands for.
+    amplitudes = SPACE.compute_amplitudes(modes.stress, modes.gradient).T
+    response = matrix[: layout.n_pads] @ amplitudes
     noise = np.ones(layout.n_pads)
     return make_estimator(response, noise, modes, neglect=NEGLECTED_MODES[name]).matrix

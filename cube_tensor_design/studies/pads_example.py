@@ -20,7 +20,7 @@ from cube_tensor_driver.core.defaults import POISSONS_RATIO, SURFACE_DEPTH
 from cube_tensor_driver.core.modes import COMPONENTS
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.mechanics import contact
-from cube_tensor_driver.simulation.cubes import compute_true_state
+from cube_tensor_driver.simulation.cubes import compute_true_amplitudes
 
 from .field_study import compute_field_below
 
@@ -97,7 +97,7 @@ def sweep(points: int = 129) -> Sweep:
     at_sensor = _compute_field_beside_ball(np.array([-BALL_X]))[0]
     passing = _compute_field_beside_ball(-place)
     gradient = passing[:, 6:].reshape(points, 6, 3)
-    pads = compute_true_state(calibration, passing[:, :6], gradient) @ calibration.response.T
+    pads = compute_true_amplitudes(calibration, passing[:, :6], gradient) @ calibration.response.T
 
     to_components = Pipeline([calibration]).find_matrix(0)
     left, right = (calibration.layout.pads.index(name) for name in PAIR)

@@ -278,8 +278,8 @@ class TractionBench:
         stress = rotate_stress(field[:, :6], to_cube)
         gradient = to_gradient_tensor(field[:, 6:].reshape(-1, 6, 3))
         gradient = rotate_gradient(gradient, to_cube)
-        state = calibration.modes.compute_state(stress, calibration.half_side * gradient)
-        return state @ calibration.response.T
+        amplitudes = calibration.modes.compute_amplitudes(stress, calibration.half_side * gradient)
+        return amplitudes @ calibration.response.T
 
     def measure(
         self,

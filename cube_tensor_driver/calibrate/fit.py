@@ -191,7 +191,7 @@ def loads_from_forces(
     stress = np.zeros((len(force), 6))
     zx_yz_zz = [4, 3, 2]
     stress[:, zx_yz_zz] = force / area
-    return modes.compute_state(stress)
+    return modes.compute_amplitudes(stress)
 
 
 def fit(

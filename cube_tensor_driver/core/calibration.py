@@ -240,8 +240,7 @@ class Calibration:
     def response(self) -> Array:
         """Response matrix (P, M) including the gains, in Pa per Pa.
 
-        The stresses on the pads are response @ state, where the state holds the amplitudes of the
-        modes.
+        The stresses on the pads are response @ amplitudes of the modes.
         """
         if self.coefficients is not None:
             matrix = compute_response(self.structure, self.coefficients)

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Inversion of a response by generalised least squares, and the residual that shows broken pads.
 
-The pads measure the stresses v = A s, where A is the response (pads x modes) and the state s holds
-the amplitudes of the modes. The estimated quantities are:
+The pads measure the stresses v = A s, where A is the response (pads x modes) and s holds the
+amplitudes of the modes. The estimated quantities are:
 
     components    H W v,   H = T (D W A)^+ D
     covariance    H H'
@@ -12,7 +12,7 @@ the amplitudes of the modes. The estimated quantities are:
     W             diag(1 / noise)
     D             (1 + W c (W c)')^(-1/2), where c are the stresses on the pads by one standard
                   deviation of a drift that all pads have in common
-    T             matrix from a state to components, see Modes.components
+    T             matrix from amplitudes to components, see Modes.components
     (D W A)^+     pseudo-inverse of D W A
     N             its columns are an orthonormal basis of the vectors that are orthogonal to all
                   columns of D W A; their number is the number of degrees of freedom
@@ -167,7 +167,7 @@ def make_estimator(
         missing: Numbers of pads that are not used.
         neglect: Names of modes whose amplitude is assumed to be zero. Components with a part along
             these modes count as not observed.
-        targets: Map (T, M) from a state (amplitudes of the modes) to the quantities to estimate; by
+        targets: Map (T, M) from the amplitudes of the modes to the quantities to estimate; by
             default the 15 components of stress and gradient.
         drift: Stress on each pad, in Pa, by one standard deviation of a drift that all pads have in
             common (P,).

@@ -125,7 +125,7 @@ class Modes:
 
     @property
     def components(self) -> Array:
-        """Matrix T (15, M) from a state (amplitudes of the modes) to the published components.
+        """Matrix T (15, M) from the amplitudes of the modes to the published components.
 
         The components are in Pa; gradients are multiplied by d0 (half the side of the cube).
         """
@@ -140,8 +140,8 @@ class Modes:
             row /= row.sum()
         return rows @ self.fields
 
-    def compute_state(self, stress: Array, gradient: Array | None = None) -> Array:
-        """Compute the states (amplitudes of the modes) of given stress fields.
+    def compute_amplitudes(self, stress: Array, gradient: Array | None = None) -> Array:
+        """Compute the amplitudes of the modes in given stress fields.
 
         A part of a field that no mode expresses is ignored: one that violates equilibrium or, for
         plane modes, one outside the plane.
@@ -163,11 +163,11 @@ class Modes:
         g = np.asarray(gradient, dtype=float)
         g = g.reshape(-1, 27)
         fields = np.concatenate([s, g], axis=1)
-        state: Array = fields @ self.reading.T
-        return state
+        amplitudes: Array = fields @ self.reading.T
+        return amplitudes
 
     def compute_action(self, rotation: Array) -> Array:
-        """Compute the matrix that transforms states when the field is rotated or mirrored.
+        """Compute the matrix that transforms amplitudes when the field is rotated or mirrored.
 
         The field transforms as S'_ij = R_ia R_jb S_ab and G'_ijk = R_ia R_jb R_kc G_abc.
 
@@ -175,7 +175,7 @@ class Modes:
             rotation: Rotation or mirror R (3, 3).
 
         Returns:
-            Matrix (M, M) with state' = action @ state.
+            Matrix (M, M) with amplitudes' = action @ amplitudes.
 
         Raises:
             SymmetryError: The rotated modes are not combinations of the modes, for example plane

@@ -128,7 +128,7 @@ class SimulatedCubes:
         """
         pad_stress = np.empty((len(stress), self.n_pads))
         for calibration, rows in self._groups:
-            state = compute_true_state(
+            state = compute_true_amplitudes(
                 calibration,
                 stress[rows],
                 gradient[rows],
@@ -314,7 +314,7 @@ def group_by_calibration(
     ]
 
 
-def compute_true_state(
+def compute_true_amplitudes(
     calibration: Calibration,
     stress: Array,
     gradient: Array,
@@ -334,7 +334,7 @@ def compute_true_state(
     """
     # The modes take gradients in Pa, as the change of the stress over half the side of a cube.
     change = to_gradient_tensor(gradient) * calibration.half_side
-    return calibration.modes.compute_state(stress, change)
+    return calibration.modes.compute_amplitudes(stress, change)
 
 
 def compute_skin_components(
@@ -354,7 +354,7 @@ def compute_skin_components(
     """
     components = np.empty((len(skin.cubes), len(COMPONENTS)))
     for calibration, rows in group_by_calibration(skin.calibrations):
-        state = compute_true_state(calibration, stress[rows], gradient[rows])
+        state = compute_true_amplitudes(calibration, stress[rows], gradient[rows])
         in_pascal = state @ calibration.modes.components.T
         components[rows] = in_pascal * calibration.component_scale
     return components

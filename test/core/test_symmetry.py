@@ -170,13 +170,13 @@ def test_a_field_becomes_a_state_and_back():
     state = np.random.default_rng(1).normal(size=(5, 21))
     stress = np.einsum("nm,mij->nij", state, SPACE.stress)
     gradient = np.einsum("nm,mijk->nijk", state, SPACE.gradient)
-    np.testing.assert_allclose(SPACE.compute_state(stress, gradient), state, atol=1e-14)
+    np.testing.assert_allclose(SPACE.compute_amplitudes(stress, gradient), state, atol=1e-14)
     read = np.concatenate(
         [to_voigt(stress), np.einsum("niij->nij", gradient).reshape(5, 9)], axis=1
     )
     np.testing.assert_allclose(state @ SPACE.components.T, read, atol=1e-14)
     np.testing.assert_array_equal(
-        PLANE.compute_state(np.array([[3, 9, 1, 9, 2, 9.0]])), [[1, 2, 3, 0, 0, 0, 0]]
+        PLANE.compute_amplitudes(np.array([[3, 9, 1, 9, 2, 9.0]])), [[1, 2, 3, 0, 0, 0, 0]]
     )
     np.testing.assert_array_equal(to_voigt(to_matrix(np.arange(6.0))), np.arange(6.0))
 
@@ -323,7 +323,7 @@ def test_the_illustrative_responses_agree_with_each_other():
     structures = {n: find_structure(LAYOUTS[n], g) for n, g in whole.items()}
     a = {n: compute_response(s, choose_illustrative_coefficients(s)) for n, s in structures.items()}
     np.testing.assert_array_equal(a["quad"], a["planar"][:4])
-    plane_in_space = SPACE.compute_state(PLANE.stress, PLANE.gradient).T
+    plane_in_space = SPACE.compute_amplitudes(PLANE.stress, PLANE.gradient).T
     np.testing.assert_allclose(a["cube"][:8] @ plane_in_space, a["planar"], atol=1e-15)
     for name, symmetry in (("planar", "mirrors"), ("cube", "slab"), ("cube", "none")):
         structure = find_structure(LAYOUTS[name], symmetry)

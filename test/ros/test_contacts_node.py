@@ -89,7 +89,9 @@ def frequencies(skin: Skin, force: np.ndarray, centre: np.ndarray) -> np.ndarray
     stress, slope = contact.field(below, *load, ELASTOMER.poisson)
     calibration = skin.calibrations[0]
     gradient = np.moveaxis(to_matrix(slope.swapaxes(1, 2)), 1, 3)  # (cubes, 3, 3, axis)
-    state = calibration.modes.compute_state(to_matrix(stress), calibration.half_side * gradient)
+    state = calibration.modes.compute_amplitudes(
+        to_matrix(stress), calibration.half_side * gradient
+    )
     pads = state @ calibration.response.T
     rest, beta = calibration.rest_frequency, calibration.beta
     return compute_pad_frequency(pads, rest, beta, calibration.modulus)

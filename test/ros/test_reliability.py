@@ -127,9 +127,9 @@ def loaded(pascal):
     """Frequencies under a uniform zz."""
     stress, gradient = np.zeros((1, 6)), np.zeros((1, 6, 3))
     stress[0, 2] = pascal
-    from cube_tensor_driver.simulation.cubes import compute_true_state
+    from cube_tensor_driver.simulation.cubes import compute_true_amplitudes
 
-    v = compute_true_state(CALIBRATION, stress, gradient) @ CALIBRATION.response.T
+    v = compute_true_amplitudes(CALIBRATION, stress, gradient) @ CALIBRATION.response.T
     return compute_pad_frequency(
         v[0], CALIBRATION.rest_frequency, CALIBRATION.beta, CALIBRATION.modulus
     )

@@ -35,7 +35,7 @@ from cube_tensor_driver.simulation.cubes import (
     PadErrors,
     SimulatedCubes,
     compute_skin_components,
-    compute_true_state,
+    compute_true_amplitudes,
     make_hub_cubes,
 )
 from cube_tensor_driver.simulation.hub import SimulatedHub
@@ -65,7 +65,7 @@ def test_the_load_comes_out_again():
         found = reconstruct(rows)
         stress, gradient = load.compute_stress_field(1e-9 * rows.stamp_ns[0])
         frequency = compute_pad_frequency(
-            compute_true_state(calibration, stress, gradient) @ calibration.response.T, *law
+            compute_true_amplitudes(calibration, stress, gradient) @ calibration.response.T, *law
         )
         rounding = 0.5e-3 + 2.0**-24 * frequency
         slope = modulus * (1 + beta) / (rest * (1 - beta * (frequency / rest - 1)) ** 2)
