@@ -81,15 +81,12 @@ class CubeCamera(Camera):  # type: ignore[misc]
                 height=self.height or 0,
                 full_scale=config.full_scale,
             )
+            if warmup:
+                self.async_read(1000 * CONNECT_TIMEOUT_S)
         except BaseException:
+            self.disconnect()
             source.close()
             raise
-        if warmup:
-            try:
-                self.async_read(1000 * CONNECT_TIMEOUT_S)
-            except BaseException:
-                self.disconnect()
-                raise
 
     def read(self) -> AnyArray:
         """Return a picture of the skin and record the samples since the last one."""

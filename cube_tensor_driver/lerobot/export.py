@@ -93,7 +93,8 @@ def export_lerobot(
             with open_bag(plan.path, choices.frequencies) as source:
                 rows = _read_stress(plan, source, choices, calibrations)
                 windows = stream_windows(rows, plan.blocks, plan.counts, depth)
-                data_set.write_bag(plan, _add_topics(plan, windows, source.bag, topics, report))
+                columns = _add_topics(plan, windows, source.bag, topics, report)
+                data_set.write_bag(plan, columns)
         data_set.write_meta(skin, calibrations)
     return Exported(
         episodes=sum(len(plan.episodes) for plan in plans),

@@ -305,7 +305,8 @@ def find_nearest_cubes(skin: Skin, width: int, height: int) -> Index:
     # The centres of the cubes fill 1/1.2 of the picture. With this margin, the cubes at the edges
     # appear about as large as the others.
     pixel = 1.2 * max(np.ptp(across) / width, np.ptp(up) / free) or 1.0
-    distance_x = np.subtract.outer(pixel * (np.arange(width) - width / 2), across)
+    x = pixel * (np.arange(width) - width / 2)
+    distance_x = np.subtract.outer(x, across)
     nearest = np.zeros((height, width), np.intp)
     for row in range(top, height):
         distance_y = pixel * (top + free / 2 - row) - up
