@@ -8,6 +8,7 @@ integrals. Their variances follow from the covariance of the nodes' forces.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -123,53 +124,53 @@ def estimate_contact(
         size: Radius of a node in m.
     """
     force = moments[:, 0]
-    normal_force = min(float(force[2]), -_MIN_NORMAL_FORCE)
-    x, y = arm = moments[2, 1:3] / normal_force
-    force_x, force_y = force[:2].tolist()
-    moment = moments[1, 1] - x * force_y - moments[0, 2] + y * force_x
+    force_x, force_y, force_z = force.tolist()
+    normal_force = min(force_z, -_MIN_NORMAL_FORCE)
+    x, y, xx, xy, yy = (moments[2, 1:] / normal_force).tolist()
+    moment = float(moments[1, 1] - moments[0, 2]) - x * force_y + y * force_x
 
     # The second moment of the pressure is that of the forces at the nodes, plus that of the Hertz
     # pressure of one node about its own centre. Its eigenvectors are the axes of the ellipse.
     node_moment = _HERTZ_MOMENT * size**2
-    xx, xy, yy = moments[2, 3:] / normal_force
-    second_moment = np.array([[xx, xy], [xy, yy]]) - np.outer(arm, arm)
-    eigenvalues, axes = np.linalg.eigh(second_moment)
-    principal_moments = np.maximum(eigenvalues, 0) + node_moment
-    area = float(np.pi / _HERTZ_MOMENT * np.sqrt(principal_moments.prod()))
+    xx, xy, yy = xx - x * x, xy - x * y, yy - y * y
+    mean, half_difference = (xx + yy) / 2, (xx - yy) / 2
+    radius = math.hypot(half_difference, xy)
+    larger_moment = max(mean + radius, 0.0) + node_moment
+    smaller_moment = max(mean - radius, 0.0) + node_moment
+    area = math.pi / _HERTZ_MOMENT * math.sqrt(larger_moment * smaller_moment)
+    direction = math.atan2(xy, half_difference) / 2
+    cosine, sine = math.cos(direction), math.sin(direction)
+    by_larger, by_smaller = 1 / larger_moment, 1 / smaller_moment
+    by_xx = cosine**2 * by_larger + sine**2 * by_smaller
+    by_xy = cosine * sine * (by_larger - by_smaller)
+    by_yy = sine**2 * by_larger + cosine**2 * by_smaller
 
     # `slopes` are the derivatives (4, 3, 6) of the position (x, y), the moment and the area by the
-    # moments of the forces along x, y and z.
+    # moments of the forces along x, y and z, where those by z are multiplied by the normal force.
+    by_x = [-x, 1.0, 0.0, 0.0, 0.0, 0.0]
+    by_y = [-y, 0.0, 1.0, 0.0, 0.0, 0.0]
+    along, across = by_xx * x + by_xy * y, by_xy * x + by_yy * y
+    constant = x * along + y * across + node_moment * (by_xx + by_yy) - 2
+    by_area = [constant, -2 * along, -2 * across, by_xx, 2 * by_xy, by_yy]
     slopes = np.zeros((4, 3, N_MOMENTS))
-    slopes[0, 2, :2] = -x, 1
-    slopes[1, 2, [0, 2]] = -y, 1
+    slopes[:, 2] = by_x, by_y, np.zeros(N_MOMENTS), by_area
     slopes[2, 0, [0, 2]] = y, -1
     slopes[2, 1, :2] = -x, 1
     slopes[2, 2] = force_x * slopes[1, 2] - force_y * slopes[0, 2]
-    inverse_moment = (axes / principal_moments) @ axes.T
-    (by_xx, by_xy), (_, by_yy) = inverse_moment.tolist()
-    constant = node_moment * (by_xx + by_yy) - 2
-    slopes[3, 2] = [
-        arm @ inverse_moment @ arm + constant,
-        *(-2 * inverse_moment @ arm),
-        by_xx,
-        2 * by_xy,
-        by_yy,
-    ]
     slopes[3, 2] *= area / 2
     slopes[:, 2] /= normal_force
 
     propagated_root = slopes.reshape(4, -1) @ root.reshape(-1, root.shape[2])
     variance = (propagated_root**2).sum(axis=1)
     force_root = root[:, 0]
-    smaller_moment, larger_moment = principal_moments
     return ContactEstimate(
         force=force,
         force_covariance=force_root @ force_root.T,
-        place=centre + arm,
+        place=centre + np.array([x, y]),
         place_variance=variance[:2],
-        moment=float(moment),
+        moment=moment,
         moment_variance=float(variance[2]),
         area=area,
         area_variance=float(variance[3]),
-        aspect=float(np.sqrt(larger_moment / smaller_moment)),
+        aspect=math.sqrt(larger_moment / smaller_moment),
     )

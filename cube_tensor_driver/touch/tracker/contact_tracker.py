@@ -33,8 +33,11 @@ from .local_values import CubeNoise, make_rotations_about_normal, unroll_points
 from .node_fit import NodeFit
 from .pressure_regions import PressureRegions
 from .tracked_region import (
+    HOPELESS,
+    MAX_STEPS,
     TrackedRegion,
     Work,
+    iterate,
     update_responses,
 )
 
@@ -46,7 +49,7 @@ when the regions beside it are fitted, too."""
 MAX_REGIONS = 32
 """Largest number of regions of contact on one skin; those with the largest pressure are kept."""
 
-MAX_WORK_PER_SCAN = 14.0
+MAX_WORK_PER_SCAN = 17.0
 """Largest computing time of the steps of fits in one scan (set of values of all cubes), in ms, as
 estimated by `WORK_MS`. The remaining steps are made in the next scans; one step is always made."""
 
@@ -330,36 +333,37 @@ class ContactTracker:
         linearise(self._inverse, [fit for fit in hertz_fits if fit.needs_linearisation])
         if len(fitted) > 1:
             update_responses(self._inverse, fitted, self._fitted_cubes)
-        total, deviation = self._sum_responses()
+        total, deviation = self._sum_responses(slice(None))
         for region in fitted:
             fit = region.fit
             if fit is not None:
-                region.subtract_others(fit.values, total, deviation)
                 cubes = fit.values.cubes
+                region.subtract_others(fit.values, total[cubes], deviation[cubes])
                 before = region.response[cubes]
                 region.step()
                 total[cubes] += region.response[cubes] - before
 
-    def _sum_responses(self) -> tuple[Array, Array]:
-        """Return the stored response (cubes, C), in Pa, of all cubes to all regions, and its
-        standard deviation (cubes, C)."""
-        total = np.zeros(self._scaled.shape)
-        deviation = np.zeros(self._scaled.shape)
+    def _sum_responses(self, cubes: Index | slice) -> tuple[Array, Array]:
+        """Return the stored response (n, C), in Pa, of n cubes to all regions, and its standard
+        deviation (n, C)."""
+        total = np.zeros_like(self._scaled[cubes])
+        deviation = np.zeros_like(total)
         for region in self._regions:
-            total += region.response
+            response = region.response[cubes]
+            total += response
             # Deviations add linearly, because the same errors of the elastomer cause them.
-            deviation += region.relative_error * np.abs(region.response)
+            deviation += region.relative_error * np.abs(response)
         return total, deviation
 
     def _respond(self, cubes: Index) -> tuple[Array, Array]:
-        """Return `_sum_responses`, after outdated responses of some cubes are computed again.
+        """Return `_sum_responses` of some cubes, after outdated responses are computed again.
 
         Args:
             cubes: Indices (n,) of the cubes.
         """
         if len(self._regions) > 1:
             update_responses(self._inverse, self._regions, cubes)
-        return self._sum_responses()
+        return self._sum_responses(cubes)
 
     def _improve_fits(self, max_work: float) -> None:
         """Make and improve fits of regions, the most urgent first (`Work`), up to a limit of work.
@@ -380,9 +384,44 @@ class ContactTracker:
             left -= region.estimate_ms(work)
             if left < 0 and not is_first:
                 break
-            region.improve(work)
             is_first = False
-            order[number] = region.next_work, -region.waited
+            improved = [number]
+            if work == Work.BEGIN:
+                # Many fits that begin together take little longer than one.
+                one_ms = region.estimate_ms(work)
+                begun = [k for k, (other, _) in enumerate(order) if other == Work.BEGIN]
+                begun.sort(key=order.__getitem__)
+                improved = [k for n, k in enumerate(begun) if n * one_ms <= max(left, 0.0)]
+                left -= (len(improved) - 1) * one_ms
+                self._begin_fits([self._regions[k] for k in improved])
+            else:
+                region.improve(work)
+            for k in improved:
+                order[k] = self._regions[k].next_work, -self._regions[k].waited
+
+    def _begin_fits(self, regions: list[TrackedRegion]) -> None:
+        """Make the first fit of a Hertz contact in each of some regions."""
+        inverse = self._inverse
+        homes = [region.home for region in regions]
+        cubes = np.unique(inverse.near[homes])
+        self._noise.update(self._scaled, cubes)
+        if len(self._regions) > 1:
+            update_responses(inverse, self._regions, cubes)
+        responses = self._sum_responses(slice(None))
+        started = [
+            region.start_hertz(home, *responses)
+            for region, home in zip(regions, homes, strict=True)
+        ]
+        iterate(inverse, started, MAX_STEPS // 2)
+        unfinished = [
+            one
+            for region, one in zip(regions, started, strict=True)
+            if one[0].needs_linearisation
+            and one[0].shape_misfit < HOPELESS * region.max_first_misfit
+        ]
+        iterate(inverse, unfinished, MAX_STEPS // 2)
+        for region, (fit, _) in zip(regions, started, strict=True):
+            region.accept_hertz(fit)
 
     def _integrate_field(self, field: TractionField) -> None:
         """Estimate the contacts of regions without a fit by integrals of the traction field.
@@ -404,12 +443,8 @@ class ContactTracker:
             if region.fit is None:
                 is_own = (owner[points] == number) | (owner[points] < 0)
                 own = points[is_own]
-                region.integral = self._integrate(
-                    region,
-                    own,
-                    inverse.area / claims[own],
-                    field,
-                )
+                weight = inverse.area / claims[own]
+                region.take_integral(self._integrate(region, own, weight, field))
 
     def _integrate(
         self,

@@ -243,6 +243,11 @@ class HertzFit:
         return self.last_step > REPEAT_STEP
 
     @property
+    def is_pressing(self) -> bool:
+        """Whether all contacts press on the surface; none pulls."""
+        return bool(self.found.forces[:, 2].max() < 0)
+
+    @property
     def inflation(self) -> float:
         """Factor by which all variances are multiplied if residuals are larger than noise explains.
 

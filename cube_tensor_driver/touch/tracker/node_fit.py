@@ -114,10 +114,6 @@ the largest evidence (probability of the values)."""
 _RELATIVE_DEVIATIONS = np.array([SHEAR_RATIO, SHEAR_RATIO, 1.0])
 """Prior standard deviations of the traction along x, y and z, divided by that of the pressure."""
 
-MIN_SENSITIVE_SHARE = 0.05
-"""Smallest force of a node (small contact) that takes part in the computation of how errors of the
-elastomer change the values, divided by the largest force of a node. The sum over all nodes would
-take half as long again."""
 
 MIN_SIGNAL_TO_NOISE = 1e-4
 """Smallest ratio of prior variance to noise variance with which a combination of the nodes' forces
@@ -151,6 +147,29 @@ class NodePosterior(NamedTuple):
     to_errors: Array
     by_errors: Array
     root: Array
+    occam_term: float
+
+
+class _Scale(NamedTuple):
+    """Scale s of the prior, and what follows from it (head of this file).
+
+    The S properties of the elastomer are the depth, which comes first, and others, whose errors are
+    estimated.
+
+    Attributes:
+        scale: Scale s in Pa.
+        variances: Variances (3 q,) of the amplitudes of the eigenvectors.
+        signal_to_noise: Ratio (3 q,) of prior variance and noise variance of each amplitude.
+        errors: Changes (S - 1, 2) of the estimated errors by the values and by the depth.
+        information: Precision (S - 1, S - 1) of the estimated errors.
+        occam_term: Part of -2 ln of the evidence that does not depend on the values.
+    """
+
+    scale: float
+    variances: Array
+    signal_to_noise: Array
+    errors: Array
+    information: Array
     occam_term: float
 
 
@@ -232,7 +251,7 @@ class NodeFit:
         self.is_sharp = False
 
     def solve(self, white: Array) -> None:
-        """Compute the posterior with the same prior for all nodes.
+        """Compute the forces with the same prior for all nodes. `settle` computes their posterior.
 
         Args:
             white: Values (n C,), C components of stress and gradient of each of n cubes,
@@ -241,11 +260,12 @@ class NodeFit:
         whitening = self.values.whitening
         white_response = whitening @ self._response.reshape(*whitening.shape[:2], -1)
         self._white_response = white_response.reshape(len(white), 3, -1)
-        no_errors = np.zeros((*self.values.known.shape, 1))
-        self._set_sensitivity(no_errors)
         equal_envelope = np.ones(len(self.places))
         self._decomposition = self._decompose(equal_envelope)
-        self._condition(white)
+        _, to_amplitudes, basis = self._decomposition
+        projected = to_amplitudes @ white
+        scale = self._find_scale(white[:, None], projected[:, None])
+        self.forces = (basis @ (scale.variances * projected)).reshape(3, -1)
         self.is_solved = True
         self.is_settled = False
         self.is_sharp = False
@@ -256,12 +276,10 @@ class NodeFit:
         Args:
             white: Whitened values (n C,), as for `solve`.
         """
-        strength = np.abs(self.forces).max(axis=0)
-        is_strong = strength > MIN_SENSITIVE_SHARE * strength.max()
         sensitivity = self.values.compute_sensitivity(
-            self.places[is_strong],
+            self.places,
             self.size,
-            self.forces[:, is_strong],
+            self.forces,
         )
         self._set_sensitivity(sensitivity)
         self._condition(white)
@@ -380,11 +398,44 @@ class NodeFit:
         Args:
             white: Whitened values (n C,).
         """
-        eigenvalues, to_amplitudes, basis = self._decomposition
+        _, to_amplitudes, basis = self._decomposition
         # Column 0 holds the values, column 1 their sensitivity to the depth, and the others the
         # sensitivities to further properties of the elastomer.
         columns = np.column_stack([white, self._white_sensitivity])
         projected = to_amplitudes @ columns
+        best = self._find_scale(columns, projected)
+        scale, variances, information = best.scale, best.variances, best.information
+        by_column = basis @ (variances[:, None] * projected[:, 1:])
+        by_depth = by_column[:, :1] - by_column[:, 1:] @ best.errors[:, 1:]
+        # The covariance is the sum of three parts: that for an exactly known elastomer, and those
+        # due to its estimated errors and to the error of the depth. Its square root consists of the
+        # columns of the square roots of these parts.
+        cholesky_factor = np.linalg.cholesky(information)
+        errors_root = np.linalg.inv(cholesky_factor).T
+        exact_root = basis * np.sqrt(variances)
+        root = np.hstack([exact_root, by_column[:, 1:] @ errors_root, by_depth])
+        to_errors = columns[:, 2:].T - (projected[:, 2:].T * variances) @ to_amplitudes
+        is_known = best.signal_to_noise > MIN_SIGNAL_TO_NOISE
+        self.posterior = NodePosterior(
+            response=(scale * to_amplitudes[is_known]).astype(np.float32),
+            shrinkage=variances[is_known] / scale**2,
+            to_forces=scale * basis[:, is_known],
+            to_errors=np.linalg.solve(information, to_errors),
+            by_errors=scale * projected[is_known, 2:],
+            root=root.reshape(3, len(self.places), -1),
+            occam_term=best.occam_term,
+        )
+        self.step(white)
+
+    def _find_scale(self, columns: Array, projected: Array) -> _Scale:
+        """Find the scale of the prior that has the largest evidence.
+
+        Args:
+            columns: Whitened values (n C, 1 + S), followed by their sensitivities to S properties
+                of the elastomer, the depth first.
+            projected: Products (3 q, 1 + S) of the decomposition with these columns.
+        """
+        eigenvalues = self._decomposition[0]
         prior_variances = _SCALES[:, None] ** 2
 
         # `products` are the products columns' W columns for every scale s, with the matrix
@@ -397,8 +448,7 @@ class NodeFit:
 
         # The errors of all properties but the depth are estimated together with the forces. The
         # depth only adds to the covariance.
-        n_errors = columns.shape[1] - 2
-        information = products[:, 2:, 2:] + np.eye(n_errors)
+        information = products[:, 2:, 2:] + np.eye(products[0, 2:].shape[0])
         gradients = products[:, 2:, :2]
         errors = np.linalg.solve(information, gradients)
         by_error = errors[:, :, 0] * gradients[:, :, 0]
@@ -411,30 +461,14 @@ class NodeFit:
         occam_terms = np.log1p(signal_to_noise).sum(axis=1) + log_information
         scores = chi_squared / misfit + count * np.log(misfit) + occam_terms
         best = int(np.argmin(scores))
-
-        scale = _SCALES[best]
-        variances = weights[best]
-        by_column = basis @ (variances[:, None] * projected[:, 1:])
-        by_depth = by_column[:, :1] - by_column[:, 1:] @ errors[best][:, 1:]
-        # The covariance is the sum of three parts: that for an exactly known elastomer, and those
-        # due to its estimated errors and to the error of the depth. Its square root consists of the
-        # columns of the square roots of these parts.
-        cholesky_factor = np.linalg.cholesky(information[best])
-        errors_root = np.linalg.inv(cholesky_factor).T
-        exact_root = basis * np.sqrt(variances)
-        root = np.hstack([exact_root, by_column[:, 1:] @ errors_root, by_depth])
-        to_errors = columns[:, 2:].T - (projected[:, 2:].T * variances) @ to_amplitudes
-        is_known = signal_to_noise[best] > MIN_SIGNAL_TO_NOISE
-        self.posterior = NodePosterior(
-            response=(scale * to_amplitudes[is_known]).astype(np.float32),
-            shrinkage=variances[is_known] / scale**2,
-            to_forces=scale * basis[:, is_known],
-            to_errors=np.linalg.solve(information[best], to_errors),
-            by_errors=scale * projected[is_known, 2:],
-            root=root.reshape(3, len(self.places), -1),
+        return _Scale(
+            scale=float(_SCALES[best]),
+            variances=weights[best],
+            signal_to_noise=signal_to_noise[best],
+            errors=errors[best],
+            information=information[best],
             occam_term=float(occam_terms[best]),
         )
-        self.step(white)
 
     @property
     def _envelope(self) -> Array:

@@ -164,32 +164,34 @@ def split_peaks(pressure: Array, root: Array, is_neighbour: Mask) -> Index:
     Returns:
         Number (q,) of the peak of each node, from 0 on, the highest peak first.
     """
-    owner = np.full(len(pressure), -1)
+    # The loop works on lists, because numpy takes long for the few neighbours of one node.
+    n = len(pressure)
+    owner = [-1] * n
     peaks: list[int] = []
     limit = MIN_PEAK * float(pressure.max())
+    neighbours: list[list[int]] = [[] for _ in range(n)]
+    for node, other in np.argwhere(is_neighbour).tolist():
+        neighbours[node].append(other)
     # Nodes are assigned in the order of falling pressure, each one to the peak of its neighbours. A
     # node with neighbours of two peaks is the saddle point between these peaks.
     for node in np.argsort(-pressure).tolist():
-        neighbour_owners = owner[is_neighbour[node]]
-        around = np.unique(neighbour_owners)
-        around = around[around >= 0]
-        if not len(around):
+        around = sorted({owner[other] for other in neighbours[node]} - {-1})
+        if not around:
             if pressure[node] < limit and peaks:
                 continue
-            around = np.array([len(peaks)])
+            around = [len(peaks)]
             peaks.append(node)
-        first = int(around[0])
+        first = around[0]
         owner[node] = first
-        for other in around[1:].tolist():
+        for other in around[1:]:
             peak = peaks[other]
             fall = pressure[peak] - pressure[node]
             uncertainty = np.linalg.norm(root[peak] - root[node])
             relative_limit = (1 - VALLEY) * pressure[peak]
             significant_fall = MIN_FALL * uncertainty
             if fall < max(relative_limit, significant_fall):
-                owner[owner == other] = first
+                owner = [first if one == other else one for one in owner]
     # Nodes without an owner have too little pressure for a peak of their own, and had no neighbour
     # that belongs to a peak. They are assigned to the highest peak.
-    owner[owner < 0] = 0
-    _, consecutive = np.unique(owner, return_inverse=True)
+    _, consecutive = np.unique(np.maximum(owner, 0), return_inverse=True)
     return np.asarray(consecutive.reshape(-1))

@@ -134,9 +134,9 @@ HOPELESS = 4.0
 given up without the other half."""
 
 Respond = Callable[[Index], tuple[Array, Array]]
-"""Function that takes the indices of n cubes and returns the response of all cubes of the skin to
-all regions of contact, up to date for these n: changes (cubes, C), in Pa, of their C measured
-components, and the standard deviations of these changes (cubes, C), in Pa."""
+"""Function that takes the indices of n cubes and returns their response to all regions of contact:
+changes (n, C), in Pa, of their C measured components, and the standard deviations of these changes
+(n, C), in Pa."""
 
 
 class Work(IntEnum):
@@ -161,17 +161,17 @@ class Work(IntEnum):
 
 WORK_MS = {
     Work.MOVE: 0.5,
-    Work.BEGIN: 3.5,
-    Work.SETTLE: 3.0,
-    Work.SOLVE: 4.5,
+    Work.BEGIN: 2.0,
+    Work.SETTLE: 4.0,
+    Work.SOLVE: 6.0,
     Work.CHOOSE: 2.5,
-    Work.PREPARE: 3.5,
-    Work.RENEW: 4.5,
-    Work.SHARPEN: 4.0,
+    Work.PREPARE: 5.0,
+    Work.RENEW: 6.0,
+    Work.SHARPEN: 6.5,
 }
 """Approximate CPU time, in ms, of the steps of a region with `MAX_NODES` nodes. The work in a scan
 is counted with these numbers, not with a clock, so that a recording gives the same contacts again.
-With twenty contacts, steps were measured to take up to twice as long.
+Fits that begin together (BEGIN) took 3 ms, plus 1.1 ms for each.
 """
 
 
@@ -217,6 +217,9 @@ class TrackedRegion:
         self._fitted_points = self.points
         self._fitted_peak = 0.0
         self._fitted_others: Array | float = 0.0
+        # `_others_change` is the sum of squares for `MAX_OTHERS_CHANGE`, for `_compared_others`.
+        self._compared_others: Array | float | None = None
+        self._others_change = 0.0
         self._first_misfit = 1.0
         self._is_direct = inverse.pitch < MAX_DIRECT_PITCH * inverse.depth
         self._is_hertz_due = self._is_direct
@@ -300,9 +303,12 @@ class TrackedRegion:
         """Whether the stress that other regions cause in the cubes of a fit has changed by more
         than `MAX_OTHERS_CHANGE` since the fit was made."""
         values = fit.values
-        change = np.broadcast_to(self.others - self._fitted_others, values.known.shape)
-        white = values.whitening @ change[:, :, None]
-        return float((white**2).sum()) > MAX_OTHERS_CHANGE * values.count
+        if self._compared_others is not self.others:
+            self._compared_others = self.others
+            change = np.broadcast_to(self.others - self._fitted_others, values.known.shape)
+            white = values.whitening @ change[:, :, None]
+            self._others_change = float((white**2).sum())
+        return self._others_change > MAX_OTHERS_CHANGE * values.count
 
     def _follow_home(self, fit: HertzFit) -> None:
         """Lay the skin flat around another cube if the contacts have moved there.
@@ -315,7 +321,7 @@ class TrackedRegion:
         below = values.find_nearest_cubes(found.centres)
         around = inverse.near[inverse.cube[self.points], : NEAREST_CUBES[-1]]
         is_around = all((around == cube).any() for cube in below)
-        if not is_around or found.forces[:, 2].max() >= 0:
+        if not (is_around and fit.is_pressing):
             self.fit = None
             return
         # The home cube is the origin of the frame of the contacts.
@@ -381,16 +387,16 @@ class TrackedRegion:
         """
         return self.frame, self._start if self.fit is None else self.fit.discs
 
-    @property
-    def _start(self) -> Discs:
-        """Hertz contact at which the first fit begins."""
+    def take_integral(self, integral: ContactEstimate) -> None:
+        """Store the estimate from integrals of the field, at which the first fit begins."""
+        self.integral = integral
         # The area of the integral is that of the pressure at the depth of the cubes, where a
         # squared radius is larger by about the squared depth.
         depth = self._inverse.depth
-        squared_radius = self.integral.area / np.pi - depth**2
+        squared_radius = integral.area / math.pi - depth**2
         largest = MAX_START_SIZE * depth
-        squared_radius = np.clip(squared_radius, (depth / 2) ** 2, largest**2)
-        return make_discs([self.integral._replace(area=np.pi * squared_radius)])
+        squared_radius = min(max(squared_radius, (depth / 2) ** 2), largest**2)
+        self._start = make_discs([integral._replace(area=math.pi * squared_radius)])
 
     def find_stale_cubes(self, cubes: Index) -> Index:
         """Return those of some cubes for which the stored response to this region is out of date.
@@ -486,13 +492,11 @@ class TrackedRegion:
         """Make the next step of the fit, for the newest values.
 
         Args:
-            work: Kind of the step (`next_work`).
+            work: Kind of the step (`next_work`), but not BEGIN (`start_hertz`).
         """
         self.waited = 0
         fit = self.fit
-        if work == Work.BEGIN:
-            self._begin_hertz()
-        elif work == Work.PREPARE:
+        if work == Work.PREPARE:
             self._prepare_nodes()
         elif work in (Work.SOLVE, Work.RENEW):
             self._solve_nodes()
@@ -500,7 +504,10 @@ class TrackedRegion:
             self._settle_nodes()
         elif isinstance(fit, HertzFit):
             self._steps += 1
-            self._iterate(fit, 1)
+            before = fit.found
+            iterate(self._inverse, [(fit, self._whiten(fit.values))], 1)
+            if not fit.is_pressing:
+                fit.found = before
         elif isinstance(fit, NodeFit) and work == Work.CHOOSE:
             self._replace_by_hertz(fit)
         elif isinstance(fit, NodeFit):
@@ -510,11 +517,15 @@ class TrackedRegion:
 
     def step(self) -> None:
         """Compute the fit of this region for the newest values. A `HertzFit` makes a Gauss-Newton
-        step."""
-        if self.fit is not None:
-            self.fit.step(self._whiten(self.fit.values))
-            if np.isfinite(self.gap):
-                self.store_response()
+        step; it is dropped if its contacts pull at the surface after it."""
+        fit = self.fit
+        if fit is None:
+            return
+        fit.step(self._whiten(fit.values))
+        if isinstance(fit, HertzFit) and not fit.is_pressing:
+            self.fit = None
+        elif np.isfinite(self.gap):
+            self.store_response()
 
     def store_response(self) -> None:
         """Store the response to this region that its fit predicts for the cubes of the fit."""
@@ -528,33 +539,43 @@ class TrackedRegion:
         """
         return values.whiten(self._noise.scaled, self.others)
 
-    def _iterate(self, fit: HertzFit, steps: int) -> None:
-        """Make Gauss-Newton steps until the fit has converged, but at most `steps`."""
-        white = self._whiten(fit.values)
-        for _ in range(steps):
-            linearise(self._inverse, [fit])
-            fit.step(white)
-            if not fit.needs_linearisation:
-                break
+    def start_hertz(
+        self,
+        home: int,
+        total: Array,
+        deviation: Array,
+    ) -> tuple[HertzFit, Array]:
+        """Return a fit of one Hertz contact that starts at the contact that the linear inverse
+        problem found, and the whitened values for its steps.
 
-    def _begin_hertz(self) -> None:
-        """Fit one Hertz contact, from the contact that the linear inverse problem found.
-
-        The fit is kept if its steps have converged and its misfit is small. If other regions are
-        near, their contacts may cause the misfit, which then falls when these regions are fitted,
-        too. So the fit is then kept up to a misfit of `MAX_NEAR_MISFIT`, even if its steps have not
-        converged.
+        Args:
+            home: `home` of this region.
+            total: Response (cubes, C), in Pa, of all cubes to all regions, this one included.
+            deviation: Standard deviation (cubes, C) of this response, in Pa.
         """
         self._is_hertz_due = False
-        values = self._collect(self.home, self._inverse.near[self.home])
-        self._whiten_newest(values)
-        fit = HertzFit(self._inverse, values, self._start)
-        limit = MAX_NEAR_MISFIT if self.near else MAX_HERTZ_MISFIT
-        self._iterate(fit, MAX_STEPS // 2)
-        if fit.needs_linearisation and fit.shape_misfit < HOPELESS * limit:
-            self._iterate(fit, MAX_STEPS // 2)
+        self.waited = 0
+        values = self._collect(home, self._inverse.near[home])
+        self.subtract_others(values, total[values.cubes], deviation[values.cubes])
+        values.refresh()
+        return HertzFit(self._inverse, values, self._start), self._whiten(values)
+
+    @property
+    def max_first_misfit(self) -> float:
+        """Largest misfit with which the first Hertz contact of this region is kept."""
+        return MAX_NEAR_MISFIT if self.near else MAX_HERTZ_MISFIT
+
+    def accept_hertz(self, fit: HertzFit) -> None:
+        """Keep the fit of the first Hertz contact if it presses, its steps converged and its misfit
+        is small.
+
+        If other regions are near, their contacts may cause the misfit, which then falls when these
+        regions are fitted, too. So the fit is then kept up to a misfit of `MAX_NEAR_MISFIT`, even
+        if its steps have not converged.
+        """
+        is_plausible = fit.is_pressing and fit.shape_misfit < self.max_first_misfit
         is_settled = not fit.is_unsettled or self.near
-        if values.count and is_settled and fit.shape_misfit < limit:
+        if fit.values.count and is_plausible and is_settled:
             self._accept(fit)
             self._first_misfit = MAX_HERTZ_MISFIT / MAX_MISFIT_GROWTH
 
@@ -571,13 +592,12 @@ class TrackedRegion:
         Args:
             values: Cubes of the fit. Its attribute `disturbance` is set to the standard deviation
                 of `others`.
-            total: Response (cubes, C), in Pa, of all cubes to all regions, this one included.
-            deviation: Standard deviation (cubes, C) of this response, in Pa.
+            total: Response (n, C), in Pa, of these cubes to all regions, this one included.
+            deviation: Standard deviation (n, C) of this response, in Pa.
         """
-        cubes = values.cubes
-        own = self.response[cubes]
-        self.others = total[cubes] - own
-        values.disturbance = deviation[cubes] - self.relative_error * np.abs(own)
+        own = self.response[values.cubes]
+        self.others = total - own
+        values.disturbance = deviation - self.relative_error * np.abs(own)
 
     def _prepare_nodes(self) -> None:
         """Prepare a fit of the traction on nodes (small contacts on a grid).
@@ -629,7 +649,7 @@ class TrackedRegion:
         log_sizes = np.minimum(discs.log_sizes, np.log(largest_size))
         discs = discs._replace(log_sizes=log_sizes)
         fit = HertzFit(self._inverse, nodes.values, discs)
-        self._iterate(fit, MAX_STEPS)
+        iterate(self._inverse, [(fit, self._whiten(fit.values))], MAX_STEPS)
         # The evidence of all cubes can hide a misfit of the nearest cubes. So their misfit is
         # tested, too, except if there are other regions, whose contacts may cause it.
         is_round = fit.shape_misfit < MAX_HERTZ_MISFIT or np.isfinite(self.gap)
@@ -648,8 +668,28 @@ class TrackedRegion:
         self._fitted_points = self.points
         self._fitted_peak = self.peak
         self._fitted_others = self.others
+        self._compared_others = None
         lowest_misfit = MAX_HERTZ_MISFIT / MAX_MISFIT_GROWTH
         self._first_misfit = max(fit.shape_misfit, lowest_misfit)
+
+
+def iterate(
+    inverse: SurfaceInverse,
+    fits: Sequence[tuple[HertzFit, Array]],
+    steps: int,
+) -> None:
+    """Make Gauss-Newton steps until each fit has converged, but at most a number of them.
+
+    Args:
+        inverse: Responses of the skin.
+        fits: The fits, each with its whitened values.
+        steps: The number.
+    """
+    for _ in range(steps):
+        linearise(inverse, [fit for fit, _ in fits])
+        for fit, white in fits:
+            fit.step(white)
+        fits = [one for one in fits if one[0].needs_linearisation]
 
 
 def update_responses(
