@@ -125,28 +125,35 @@ class ContactWriter:
 
     def write(
         self,
-        rows: StressRows,
-        stamp_ns: int,
-        recorded_ns: int,
+        stress: StressRows,
+        stamps_ns: list[int],
+        recorded_ns: list[int],
     ) -> None:
-        """Compute touches and contacts from the stress of one message and write them into the bag.
+        """Compute touches and contacts from the stress of M messages and write them into the bag.
+
+        If the stress has errors other than noise (`Reconstructor.has_errors`), it must be that of
+        one message, because the errors are those of its newest rows.
 
         Args:
-            rows: Rows of stress of the message.
-            stamp_ns: Stamp of the message, in ns since the Unix epoch.
-            recorded_ns: Time at which the message of frequencies was recorded, in ns since the Unix
-                epoch. Touches and contacts get the same time.
+            stress: Rows of stress of all M messages, which have the same number of rows.
+            stamps_ns: (M,) stamps of the messages, in ns since the Unix epoch.
+            recorded_ns: (M,) time at which each message of frequencies was recorded, in ns since
+                the Unix epoch. Touches and contacts get the same time.
         """
-        touches = self._touch(rows)
-        for found in touches:
-            data = encode_touch(self._frame_id, found)
-            self._writer.write(self._touches, recorded_ns, data)
-        errors = self._stress_errors.update(rows, stamp_ns)
-        if errors is not None:
-            self._errors = errors.astype(float)
-        self._latest.update(rows, stamp_ns * 1e-9)
-        newest = touches[-1] if touches else NO_TOUCHES
-        self._write_contacts(stamp_ns, recorded_ns, newest)
+        rows_per_message = len(stress) // len(stamps_ns)
+        for number, stamp_ns in enumerate(stamps_ns):
+            begin = number * rows_per_message
+            rows = stress.select(slice(begin, begin + rows_per_message))
+            self._latest.update(rows, stamp_ns * 1e-9)
+            errors = self._stress_errors.update(rows, stamp_ns)
+            if errors is not None:
+                self._errors = errors.astype(float)
+            touches = self._touch(rows)
+            for found in touches:
+                data = encode_touch(self._frame_id, found)
+                self._writer.write(self._touches, recorded_ns[number], data)
+            newest = touches[-1] if touches else NO_TOUCHES
+            self._write_contacts(stamp_ns, recorded_ns[number], newest)
 
     def _write_contacts(self, stamp_ns: int, recorded_ns: int, touches: Touches) -> None:
         """Write the contacts and traction of the newest stress of each cube, if they are due.

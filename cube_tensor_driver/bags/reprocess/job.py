@@ -305,8 +305,8 @@ def _write_skin(
         from .contacts import ContactWriter
 
         contacts = ContactWriter(writer, skin, job.contacts)
-    # The state of the compensation after each message decides how uncertain its contacts are.
-    join = contacts is None
+    # How uncertain contacts are depends on the state of the compensation after each message.
+    join = contacts is None or not _is_compensated(source, settings)
     for segment, stress, reconstructor in _reconstruct(source, settings, join=join):
         messages = segment.messages
         encoded = stress_codec.encode(
@@ -319,7 +319,19 @@ def _write_skin(
             writer.write(f"{skin}stress", time_ns, data)
         if contacts is not None:
             contacts.set_up(infos[segment.number], reconstructor)
-            contacts.write(stress, int(messages.stamp_ns[0]), times_ns[0])
+            contacts.write(stress, messages.stamp_ns.tolist(), times_ns)
+
+
+def _is_compensated(source: BagSource, settings: list[Settings]) -> bool:
+    """Return whether weight, creep or temperature may be subtracted from recorded frequencies.
+
+    Args:
+        source: The recorded frequencies.
+        settings: Calibrations and rest frequencies for each SkinInfo message of the bag.
+    """
+    calibrations = [one for current in settings for one in current.calibrations]
+    effects = [one.weight or one.creep or one.thermal for one in calibrations]
+    return source.recording.compensation.is_recorded or any(effects)
 
 
 def _recalibrate(
