@@ -32,7 +32,7 @@ from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.config.skin import Elastomer, Skin, read_skin
 from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.core.calibration import make_illustrative_calibration
-from cube_tensor_driver.core.compensation.models import WeightModel
+from cube_tensor_driver.core.compensation.models import CreepModel, WeightModel
 from cube_tensor_driver.core.defaults import FREQUENCY_NOISE
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.layout import LAYOUTS
@@ -56,6 +56,8 @@ SIDE = 5
 PITCH = 12e-3
 RATE_HZ = 50.0
 STEP_NS = 10_000_000
+IDLE_STEP_NS = 50_000_000
+"""Step while the nodes start, which is real time."""
 GAP_NS = 2_000_000_000
 """Time without scans after which everything that a node does periodically begins again."""
 IDLE_SCANS = 12
@@ -69,9 +71,11 @@ ELASTOMER = Elastomer(depth=5e-3, thickness=np.inf, poisson=0.46)
 
 
 def write_heavy_skin(folder: Path) -> Path:
-    """The file of a skin whose calibration states the response to its weight."""
+    """The file of a skin whose calibration states the response to its weight, and creep."""
     weight = WeightModel(read_weight("cube_11mm", 24))
-    heavy = replace(make_illustrative_calibration("cube"), weight=weight)
+    amplitude = np.full((24, 2), 5e-3)
+    creep = CreepModel(np.array([0.05, 1.0]), amplitude, amplitude[None])
+    heavy = replace(make_illustrative_calibration("cube"), weight=weight, creep=creep)
     (folder / "heavy.yaml").write_text(format_calibration(heavy))
     skin = describe_grid(
         nx=SIDE, ny=SIDE, pitch=PITCH, rate=100.0, layout="cube", calibration="heavy.yaml"
@@ -233,14 +237,15 @@ def test_contacts_of_an_uncertain_compensation_live_and_out_of_a_bag(ros, tmp_pa
     """Reconstruction and contacts as nodes, and reprocessing of what they published, give the same
     but for rounding, which depends on the process.
 
-    The motion of the skin is unknown. Because of the errors that this causes, the weak load is
-    found, which without them had to exceed 1.2 kPa. Method and elastomer come from the skin file.
+    Under load, the motion of the skin is unknown. Because the errors that this causes are stated, the
+    weak load is found, which without them had to exceed 1.2 kPa. Method and elastomer come from the skin file.
     Settings that state all of it give the same.
     """
     pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
     from rclpy.qos import DurabilityPolicy, QoSProfile
     from rclpy.serialization import deserialize_message
-    from sensor_msgs.msg import PointCloud2
+    from sensor_msgs.msg import Imu, PointCloud2
+    from std_msgs.msg import Float32MultiArray
 
     from cube_tensor_driver.msg import (
         SkinCompensation,
@@ -252,7 +257,7 @@ def test_contacts_of_an_uncertain_compensation_live_and_out_of_a_bag(ros, tmp_pa
     )
     from cube_tensor_driver.processes.children import Children
     from cube_tensor_driver.processes.skin_processes import Process
-    from cube_tensor_driver.ros.messages import to_ns
+    from cube_tensor_driver.ros.messages import to_ns, to_time
 
     path = write_heavy_skin(tmp_path)
     skin = read_skin(path)
@@ -270,6 +275,11 @@ def test_contacts_of_an_uncertain_compensation_live_and_out_of_a_bag(ros, tmp_pa
     contacts = ros.listen(SkinContacts, "contacts")
     clouds = ros.listen(PointCloud2, "traction")
     touches = ros.listen(SkinTouch, "touch")
+    errors = ros.listen(Float32MultiArray, "stress_errors")
+    imu = ros.node.create_publisher(Imu, "imu", 100)
+    still = Imu()
+    still.header.frame_id = skin.parent_frame
+    still.linear_acceleration.z = 9.8
     publisher = ros.node.create_publisher(SkinFrequencies, "frequencies", 100)
     random = np.random.default_rng(2)
     now_ns = 0
@@ -288,15 +298,22 @@ def test_contacts_of_an_uncertain_compensation_live_and_out_of_a_bag(ros, tmp_pa
 
     middle = np.zeros(2)
     idle = frequencies(skin, 0 * FORCE, middle)
-    given = {"config": str(path), "gravity": "nowhere", "tare_folder": str(tmp_path / "tare")}
+    given = {"config": str(path), "imu": "imu", "tare_folder": str(tmp_path / "tare")}
     with Children(tmp_path) as children:
         for name, parameters in (("reconstruction", given), ("contacts", {"rate": RATE_HZ})):
             module = f"cube_tensor_driver.ros.nodes.{name}"
             children.start(Process(name, module, parameters=parameters))
         ros.wait(lambda: publisher.get_subscription_count() and published["info"])
         now_ns = time.time_ns()
-        timer = ros.node.create_timer(0.05, lambda: send(idle))
-        ros.wait(lambda: contacts and clouds and touches, seconds=60)
+        ros.wait(lambda: imu.get_subscription_count())
+
+        def send_idle() -> None:
+            still.header.stamp = to_time(now_ns + IDLE_STEP_NS)
+            imu.publish(still)
+            send(idle, IDLE_STEP_NS)
+
+        timer = ros.node.create_timer(1e-9 * IDLE_STEP_NS, send_idle)
+        ros.wait(lambda: contacts and clouds and touches and len(errors) > 3, seconds=60)
         ros.node.destroy_timer(timer)
         ros.wait(lambda: is_answered(touches))
         scans = [idle] * IDLE_SCANS
@@ -304,7 +321,8 @@ def test_contacts_of_an_uncertain_compensation_live_and_out_of_a_bag(ros, tmp_pa
             for _ in range(SCANS):
                 middle = middle + np.array([SHIFT, 0])
                 scans.append(frequencies(skin, force, middle))
-        # The node was ready later than the first scan, with which reprocessing begins.
+        # The node was ready later than the first scan, with which reprocessing begins. In the gap, the
+        # samples of the IMU become too old, so that both get much larger errors.
         begin_ns, due_ns = now_ns + GAP_NS, 0
         for number, hertz in enumerate(scans):
             send(hertz, STEP_NS if number else GAP_NS)
