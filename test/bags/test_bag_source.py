@@ -46,7 +46,7 @@ def bag(tmp_path_factory):
 
 
 def columns(parts: list) -> list[np.ndarray]:
-    return list(concatenate(parts).columns().values())
+    return list(concatenate(parts).collect_columns().values())
 
 
 def assert_same(one: list, other: list) -> None:

@@ -20,7 +20,9 @@ def scan(status: list[int], left_out: int = 0) -> StressRows:
     """A row of each of the first cubes of three."""
     n = len(status)
     cubes, stress, gradient = np.arange(n), np.zeros((n, 6)), np.zeros((n, 9))
-    return StressRows.from_values(cubes, stress, gradient, status=np.array(status), left_out=left_out)
+    return StressRows.from_values(
+        cubes, stress, gradient, status=np.array(status), left_out=left_out
+    )
 
 
 def test_errors_are_due_twice_a_second_and_when_a_cube_becomes_uncertain():
