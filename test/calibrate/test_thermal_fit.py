@@ -17,6 +17,7 @@ from bag_maker import START_NS, info_of
 from conftest import encoded
 from cube_tensor_driver.bags.metadata import describe_quality, make_typestore
 from cube_tensor_driver.bags.write import BagWriter
+from cube_tensor_driver.calibrate.block_means import find_lags
 from cube_tensor_driver.calibrate.thermal import Warming, fit_thermal
 from cube_tensor_driver.cli import main as cli
 from cube_tensor_driver.config.calibration import find_shipped_calibration, read_calibration
@@ -244,6 +245,20 @@ def test_a_known_lag_and_slope_are_recovered(start):
     assert np.abs(fit.residual[60:]).max() < 2.5
     # The 30 s before the ramp tell the offset from the unknown start, which all pads share.
     np.testing.assert_allclose(fit.offset, 5.0, atol=1.0)
+
+
+@pytest.mark.parametrize("curvature", [0.0, 0.005])
+def test_three_temperatures_show_whether_the_effect_is_linear(curvature):
+    t = np.arange(1800.0) + 0.5
+    corners = [0, 30, 60, 600, 630, 1200, 1230], [20, 20, 35, 35, 27, 27, 40]
+    temperature = np.interp(t, *corners)
+    u = temperature - 20 - find_lags(t, temperature[:, None], np.array([140.0]))[:, 0, 0]
+    slope = np.linspace(-200.0, 180.0, 24)
+    stress = np.outer(u + curvature * u**2, slope)
+    stress += 0.3 * np.random.default_rng(2).normal(size=stress.shape)
+    found = fit_thermal(Warming("bag: cube c0", t, (0,), temperature, stress, 0.3))
+    expected = np.outer(slope, [1.0, curvature][: 2 if curvature else 1])
+    np.testing.assert_allclose(found.model.coefficient, expected, rtol=0.03, atol=0.5)
 
 
 def test_a_ramp_that_does_not_tell_lag_from_slope_is_refused():
