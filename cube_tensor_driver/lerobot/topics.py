@@ -174,12 +174,13 @@ def find_topics(paths: Sequence[Path], choices: Choices) -> dict[str, Topic]:
                 if not one.msgcount or name.startswith(cubes) or not _is_usable(msgtype):
                     continue
                 topic = found.setdefault(name, Topic(name, msgtype))
+                if choices.topics is not None and name not in wanted:
+                    continue
                 if topic.msgtype != msgtype:
                     raise BagError(
                         f"{path}: {name} is {msgtype}, in other bags {topic.msgtype}; {LEAVE_OUT}"
                     )
-                if choices.topics is None or name in wanted:
-                    topic.describe(bag)
+                topic.describe(bag)
     # Topics that were not chosen have not been described. JointState messages may have no joints.
     used = [topic for topic in found.values() if topic.names or topic.shape]
     missing = sorted(wanted.difference(topic.name for topic in used))

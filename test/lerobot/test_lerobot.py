@@ -320,6 +320,16 @@ def test_a_topic_that_one_of_two_bags_lacks_is_unknown_there(made, tmp_path):
     assert not Image.open(io.BytesIO(first)).getbbox() and Image.open(io.BytesIO(last)).getbbox()
 
 
+def test_a_topic_of_two_types_is_refused_unless_it_is_left_out(made, tmp_path, capsys):
+    bag, plain = made[0], made[0].with_name("plain")
+    state = joints(["a"], [0.0], START_NS)
+    other = with_others(plain, tmp_path / "other", [(RAW, START_NS, state)])
+    command = ["export", "lerobot", str(bag), str(other), "-o", str(tmp_path / "out")]
+    assert main([*command, "--fps", "30"]) == 1
+    assert f"{RAW} is sensor_msgs/msg/JointState" in capsys.readouterr().err
+    assert "observation.state" in export(tmp_path / "set", [bag, other], "--topics", JOINTS)
+
+
 def test_windows_take_samples_in_any_order():
     """Late links, frames without samples, frames far ahead: as a loop would place them."""
     random = np.random.default_rng(5)
