@@ -153,17 +153,22 @@ class LiveWindows:
                 "are connected and that no other program reads them"
             )
         self._has_arrived.clear()
-        # Frame numbers must rise, although the clock of the computer may be set back.
-        self._number = max(self._number + 1, time.time_ns() // NUMBER_NS)
+        now = time.time_ns() // NUMBER_NS
+        # Once the clock of the computer has been set back, stamps do not tell the frame of a
+        # sample. Then all older windows are completed, so that the frame gets what has arrived.
+        is_rising = now > self._number
+        self._write_windows(now - WRITING_DELAY_MS if is_rising else self._number)
+        self._number = now if is_rising else self._number + 1
         self._unwritten.append(self._number)
         self._parts.append([NO_ROWS])
-        self._write_windows(self._number - WRITING_DELAY_MS)
+        self._sort_arrived()
         return self._make_picture()
 
     def close(self) -> None:
         """Close the links and complete the file. Samples after the last frame are left out."""
         self._source.close()
         self._thread.join()
+        self._sort_arrived()
         self._write_windows(self._number)
         if self._writer is not None:
             self._writer.close()
@@ -183,13 +188,17 @@ class LiveWindows:
         except CubeError as error:
             self._failure = error
 
-    def _write_windows(self, last: int) -> None:
-        """Put what has arrived into windows, and write those of the frames up to `last`."""
+    def _sort_arrived(self) -> None:
+        """Put the samples that have arrived into the windows of their stamps."""
+        ends_ns = NUMBER_NS * np.array(self._unwritten)
         while self._arrived:
             rows = self._arrived.popleft()
-            window = np.searchsorted(NUMBER_NS * np.array(self._unwritten), rows.stamp_ns)
+            window = np.searchsorted(ends_ns, rows.stamp_ns)
             for index in np.unique(window):
                 self._parts[index].append(rows.select(window == index))
+
+    def _write_windows(self, last: int) -> None:
+        """Write the windows of the frames up to the number `last` to the Arrow stream."""
         while self._unwritten and self._unwritten[0] <= last:
             number, rows = self._unwritten.pop(0), concatenate(self._parts.pop(0))
             # A window has at least one place for samples, even if it has no sample.

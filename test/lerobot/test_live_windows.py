@@ -163,6 +163,27 @@ def test_a_frame_without_samples_has_an_empty_window(tmp_path, monkeypatch):
     assert np.isnan(recorded.find(pictures[1])[TACTILE]).all()
 
 
+def test_after_the_clock_was_set_back_windows_have_what_arrived(tmp_path, monkeypatch):
+    """Stamps are earlier than the frames before, so they do not tell the frame."""
+    skin = read_skin(SKIN)
+    source = HeldSource(skin)
+    cubes = len(skin.cubes)
+    live = LiveWindows(source, tmp_path, **SIZE)
+    rest = [cube.calibration.rest_frequency for cube in skin.cubes]
+    pictures = []
+    clocks_ns = BEGIN_NS + PERIOD_NS * np.array([0, 1, -1000, -999, -998])
+    for sequence, clock_ns in enumerate(clocks_ns.tolist()):
+        monkeypatch.setattr(live_module.time, "time_ns", lambda now=clock_ns: now)
+        source.give(
+            FrequencyRows.from_values(range(cubes), rest, stamp_ns=clock_ns, sequence=sequence)
+        )
+        pictures.append(live.take_next_picture(10.0))
+    live.close()
+    recorded = RecordedWindows(tmp_path)
+    sequences = [recorded.find(picture)[f"{TACTILE}.sequence"][:, 0] for picture in pictures]
+    assert [numbers.tolist() for numbers in sequences] == [[0], [1], [2], [3], [4]]
+
+
 def test_an_error_of_the_links_is_raised(tmp_path):
     class BrokenSource(HeldSource):
         def __iter__(self):
