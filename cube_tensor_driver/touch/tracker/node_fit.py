@@ -176,8 +176,8 @@ class _Scale(NamedTuple):
 class NodeFit:
     """Traction in one region on a grid of nodes (small Hertz contacts).
 
-    `solve`, `settle` and `sharpen` compute the posterior of the forces of the nodes, which takes
-    milliseconds each. `step` only multiplies the values of later scans by matrices of this
+    `solve` computes the forces of the nodes, `settle` and `sharpen` compute their posterior, which
+    takes milliseconds each. `step` only multiplies the values of later scans by matrices of this
     posterior.
 
     Attributes:
