@@ -142,46 +142,36 @@ def test_live_windows_have_the_bits_of_the_export_of_the_same_run(tmp_path, monk
         np.testing.assert_array_equal(joined, exported, name)
 
 
-def test_a_frame_without_samples_has_an_empty_window(tmp_path, monkeypatch):
-    """The samples that arrive before the second frame are stamped before the first one."""
+@pytest.mark.parametrize(
+    ("clocks", "stamps", "expected"),
+    [
+        # All samples before the second frame are stamped before the first one.
+        ([0, 1], [-1, -1], [[0, 1], []]),
+        # After the clock was set back, stamps do not tell the frame: it has what arrived.
+        ([0, 1, -1000, -999, -998], [0, 1, -1000, -999, -998], [[0], [1], [2], [3], [4]]),
+    ],
+)
+def test_windows_of_odd_stamps(tmp_path, monkeypatch, clocks, stamps, expected):
+    """Clocks at frames and stamps of the scans before them, in periods; numbers of the scans."""
     skin = read_skin(SKIN)
-    source = HeldSource(skin)
-    cubes = len(skin.cubes)
-    live = LiveWindows(source, tmp_path, **SIZE)
+    cubes = range(len(skin.cubes))
     rest = [cube.calibration.rest_frequency for cube in skin.cubes]
+    source = HeldSource(skin)
+    live = LiveWindows(source, tmp_path, **SIZE)
     pictures = []
-    for clock_ns in (BEGIN_NS, BEGIN_NS + PERIOD_NS):
-        monkeypatch.setattr(live_module.time, "time_ns", lambda now=clock_ns: now)
-        source.give(FrequencyRows.from_values(range(cubes), rest, stamp_ns=BEGIN_NS - 1))
+    for number, (clock, stamp) in enumerate(zip(clocks, stamps, strict=True)):
+        now_ns, stamp_ns = BEGIN_NS + PERIOD_NS * np.array([clock, stamp])
+        monkeypatch.setattr(live_module.time, "time_ns", lambda now=int(now_ns): now)
+        source.give(FrequencyRows.from_values(cubes, rest, stamp_ns=stamp_ns, sequence=number))
         pictures.append(live.take_next_picture(10.0))
     with pytest.raises(TimeoutError, match="no sample in 0"):
         live.take_next_picture(0.0)
     live.close()
-    recorded = RecordedWindows(tmp_path)
-    counts = [recorded.find(picture)[f"{TACTILE}.count"].tolist() for picture in pictures]
-    assert counts == [[2] * cubes, [0] * cubes]
-    assert np.isnan(recorded.find(pictures[1])[TACTILE]).all()
-
-
-def test_after_the_clock_was_set_back_windows_have_what_arrived(tmp_path, monkeypatch):
-    """Stamps are earlier than the frames before, so they do not tell the frame."""
-    skin = read_skin(SKIN)
-    source = HeldSource(skin)
-    cubes = len(skin.cubes)
-    live = LiveWindows(source, tmp_path, **SIZE)
-    rest = [cube.calibration.rest_frequency for cube in skin.cubes]
-    pictures = []
-    clocks_ns = BEGIN_NS + PERIOD_NS * np.array([0, 1, -1000, -999, -998])
-    for sequence, clock_ns in enumerate(clocks_ns.tolist()):
-        monkeypatch.setattr(live_module.time, "time_ns", lambda now=clock_ns: now)
-        source.give(
-            FrequencyRows.from_values(range(cubes), rest, stamp_ns=clock_ns, sequence=sequence)
-        )
-        pictures.append(live.take_next_picture(10.0))
-    live.close()
-    recorded = RecordedWindows(tmp_path)
-    sequences = [recorded.find(picture)[f"{TACTILE}.sequence"][:, 0] for picture in pictures]
-    assert [numbers.tolist() for numbers in sequences] == [[0], [1], [2], [3], [4]]
+    windows = [RecordedWindows(tmp_path).find(picture) for picture in pictures]
+    for window, numbers in zip(windows, expected, strict=True):
+        assert set(window[f"{TACTILE}.count"]) == {len(numbers)}
+        assert window[f"{TACTILE}.sequence"][:, 0].tolist() == (numbers or [0])
+        assert np.isnan(window[TACTILE][:, 0, 0]).all() == (not numbers)
 
 
 def test_an_error_of_the_links_is_raised(tmp_path):
