@@ -121,10 +121,10 @@ def disc(
     Raises:
         ElasticError: `radius` is not positive or `order` is below 1.
     """
-    nodes, weights = _compute_gauss_points(order)
+    points, weights = _compute_gauss_points(order)
     return _place_rings(
         radius,
-        np.sqrt(nodes),
+        np.sqrt(points),
         weights,
         force,
         centre,
@@ -144,11 +144,11 @@ def hertz(
     Arguments, result and exceptions are those of `disc`. The default order is accurate at depths of
     at least half the radius; `choose_hertz_order` returns the order for any depth.
     """
-    nodes, weights = _compute_gauss_points(order)
+    points, weights = _compute_gauss_points(order)
     # The Gauss points are placed in t = sqrt(1 - r^2) instead of r. The integrand p r dr = t^2 dt
     # is then smooth at the rim, where the pressure p as a function of r has a vertical slope.
-    radii = np.sqrt(1.0 - nodes**2)
-    fractions = 3.0 * weights * nodes**2
+    radii = np.sqrt(1.0 - points**2)
+    fractions = 3.0 * weights * points**2
     return _place_rings(
         radius,
         radii,
@@ -366,16 +366,16 @@ def _combine(trace: Array, deviator: Complex) -> Array:
 
 
 def _compute_gauss_points(order: int) -> tuple[Array, Array]:
-    """Return Gauss-Legendre nodes (order,) and weights (order,) on the interval from 0 to 1.
+    """Return Gauss-Legendre points (order,) and weights (order,) on the interval from 0 to 1.
 
     Raises:
         ElasticError: `order` is below 1.
     """
     if order < 1:
         raise ElasticError(f"quadrature order is {order}; it must be at least 1")
-    # NumPy's nodes and weights are for the interval from -1 to 1.
-    nodes, weights = np.polynomial.legendre.leggauss(order)
-    return (nodes + 1.0) / 2.0, weights / 2.0
+    # NumPy's points and weights are for the interval from -1 to 1.
+    points, weights = np.polynomial.legendre.leggauss(order)
+    return (points + 1.0) / 2.0, weights / 2.0
 
 
 def _place_rings(

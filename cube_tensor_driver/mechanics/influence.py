@@ -95,9 +95,9 @@ class Influence:
         """Cubic splines through the tabulated stresses, whose set-up takes tenths of a second."""
         # The grid contains all combinations of its x and y coordinates, sorted by x, then by y.
         axes = [np.unique(column) for column in self.place.T]
-        nodes = np.moveaxis(self.pads, 1, 0)
+        stresses = np.moveaxis(self.pads, 1, 0)
         grid_shape = [len(axis) for axis in axes]
-        grid = nodes.reshape(*grid_shape, *nodes.shape[1:])
+        grid = stresses.reshape(*grid_shape, *stresses.shape[1:])
         return RegularGridInterpolator(
             tuple(axes),
             grid,
@@ -237,6 +237,6 @@ def _check(influence: Influence) -> None:
     x, y = np.meshgrid(*axes, indexing="ij")
     grid = np.column_stack([x.ravel(), y.ravel()])
     is_grid = np.array_equal(place, grid)
-    # Cubic interpolation needs four nodes per axis.
+    # Cubic interpolation needs four points per axis.
     if min(x.shape) < 4 or not is_grid or not influence.reach > 0:
         raise ConfigError("the positions are no grid of at least 4 x 4 points around the cube")

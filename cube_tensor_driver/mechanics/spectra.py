@@ -247,9 +247,9 @@ def make_wavenumber_quadrature(depth: float) -> tuple[Array, Array]:
     Returns:
         Wavenumbers (waves,) in 1/m, and their weights (waves,) in integrals over k dk / 2 pi.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(N_WAVENUMBERS)
+    points, weights = np.polynomial.legendre.leggauss(N_WAVENUMBERS)
     half_range = MAX_WAVENUMBER_TIMES_DEPTH / depth / 2
-    k = (nodes + 1) * half_range
+    k = (points + 1) * half_range
     return k, weights * half_range * k / (2 * np.pi)
 
 
