@@ -17,6 +17,7 @@ from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.mechanics.layer import Layer
 from cube_tensor_driver.touch.inverse import SurfaceInverse
 from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
+from cube_tensor_driver.touch.tracker.hertz_fit import HertzFit
 from cube_tensor_driver.touch.tracker.local_values import CubeNoise, LocalValues
 from cube_tensor_driver.touch.tracker.tracked_region import TrackedRegion
 from workshop.bench.contacts import BALL, compute_values_under, make_bar, make_ellipse
@@ -516,6 +517,25 @@ def test_before_its_fit_a_contact_has_the_force_and_place_of_the_pressure_below(
     assert not found.refined
     np.testing.assert_allclose(found.force, force, atol=0.15 * 3)
     np.testing.assert_allclose(found.position[:2], centre, atol=0.5e-3)
+
+
+def test_a_contact_whose_fit_pulls_keeps_its_id_with_the_force_of_the_pressure_below(
+    inverse, monkeypatch
+):
+    values = ball(inverse, 5e-3, np.array([2e-3, 3e-3]), np.array([0.9, 0.0, -3.0]))
+    tracker = ContactTracker(inverse, LEAST)
+    (before,) = tracker.update(values, max_work=np.inf)
+    assert list(tracker.single_fits) == [before.id]
+    step = HertzFit.step
+
+    def pull(fit, white):
+        step(fit, white)
+        fit.found = fit.found._replace(forces=-fit.found.forces)
+
+    monkeypatch.setattr(HertzFit, "step", pull)
+    (after,) = tracker.update(values, max_work=0)
+    assert after.id == before.id and not after.refined
+    assert after.normal_force == pytest.approx(3.0, rel=0.15)
 
 
 def test_a_fit_of_an_edge_follows_the_load_without_further_work():
