@@ -17,7 +17,7 @@ from cube_tensor_driver.config.skin import Elastomer, read_skin
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.core.status import STUCK
-from cube_tensor_driver.messages.types import FREQUENCIES, INFO, STRESS
+from cube_tensor_driver.messages.types import FREQUENCIES_TYPE, INFO_TYPE, STRESS_TYPE
 
 START_NS = 1_700_000_000_000_000_000
 WRENCH = "geometry_msgs/msg/WrenchStamped"
@@ -64,7 +64,7 @@ def info_of(
     ]
     elastomer = skin.elastomer or Elastomer(np.nan, np.nan, np.nan)
     return message(
-        INFO,
+        INFO_TYPE,
         version=version,
         header=header(stamp_ns),
         sender=sender,
@@ -82,7 +82,7 @@ def info_of(
 def frequencies_of(k: int, stamp_ns: int, frequency: np.ndarray) -> object:
     n = len(frequency)
     return message(
-        FREQUENCIES,
+        FREQUENCIES_TYPE,
         header=header(stamp_ns),
         cube=np.arange(n, dtype=np.uint16),
         sequence=np.full(n, k, np.uint32),
@@ -106,7 +106,7 @@ def stress_of(source: object, pipeline: Pipeline, left_out: np.ndarray) -> objec
     )
     rows.status[:] |= np.where(left_out > 0, STUCK, 0).astype(np.uint16)
     return message(
-        STRESS,
+        STRESS_TYPE,
         header=source.header,
         cube=source.cube,
         sequence=source.sequence,
@@ -148,9 +148,13 @@ def make_bag(
         writer.write(topic, time_ns, bytes(store.serialize_cdr(one, one.__msgtype__)))
 
     with BagWriter(folder, **options) as writer:
-        for topic, kind in (("/frequencies", FREQUENCIES), ("/stress", STRESS), ("/force", WRENCH)):
+        for topic, kind in (
+            ("/frequencies", FREQUENCIES_TYPE),
+            ("/stress", STRESS_TYPE),
+            ("/force", WRENCH),
+        ):
             writer.add_topic(topic, kind, [describe_quality(depth=100)])
-        writer.add_topic("/info", INFO, [describe_quality(latched=True)])
+        writer.add_topic("/info", INFO_TYPE, [describe_quality(latched=True)])
         put("/info", START_NS, info_of(skin, pipeline, START_NS))
         made = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
         for k in range(messages):

@@ -28,7 +28,7 @@ from ..core.arrays import AnyArray, Integers, Times
 from ..core.errors import BagError, MessageError
 from ..core.rows import FrequencyRows, StressRows
 from ..messages.codec import SECOND, Decoded, MessageCodec, frequency_codec, stress_codec
-from ..messages.types import FREQUENCIES, PACKAGE
+from ..messages.types import FREQUENCIES_TYPE, PACKAGE
 from .mcap_file import McapReader
 from .metadata import SUFFIXES, make_typestore, merge_connections, read_metadata
 from .sqlite_file import SqliteReader
@@ -282,12 +282,14 @@ class Bag:
         Raises:
             BagError: The bag has no topic of frequencies, or has topics of several skins.
         """
-        names = [topic.removesuffix("frequencies") for topic in self.list_topics(FREQUENCIES)]
+        names = [topic.removesuffix("frequencies") for topic in self.list_topics(FREQUENCIES_TYPE)]
         if not names:
-            raise BagError(f"{self.path}: no topic of {FREQUENCIES}; record frequencies and info")
+            raise BagError(
+                f"{self.path}: no topic of {FREQUENCIES_TYPE}; record frequencies and info"
+            )
         if len(names) != 1:
             raise BagError(
-                f"{self.path}: {len(names)} topics of {FREQUENCIES} "
+                f"{self.path}: {len(names)} topics of {FREQUENCIES_TYPE} "
                 f"({', '.join(names)}); needed is one"
             )
         return names[0]

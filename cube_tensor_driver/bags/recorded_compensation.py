@@ -20,7 +20,7 @@ from ..core.poses import CubePoses
 from ..core.rows import FrequencyRows, concatenate
 from ..messages.codec import Decoded
 from ..messages.compensation import read_motion, read_states
-from ..messages.types import COMPENSATION
+from ..messages.types import COMPENSATION_TYPE
 from .read import MAX_DISORDER_NS, Bag, read_stamp_ns
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class CompensationReader:
         skin = topic.removesuffix("frequencies")
         self._bag = bag
         self._topic = f"{skin}compensation"
-        self.is_recorded = self._topic in bag.list_topics(COMPENSATION)
+        self.is_recorded = self._topic in bag.list_topics(COMPENSATION_TYPE)
         self._forces = ForcesAtCubes(poses)
         self._restart()
 

@@ -20,7 +20,7 @@ from ..core.reconstructor import RecordedHealth
 from ..core.rows import FrequencyRows
 from ..core.status import WORDS
 from ..messages.codec import stress_codec
-from ..messages.types import STRESS
+from ..messages.types import STRESS_TYPE
 from .read import MAX_DISORDER_NS, Bag
 
 HEALTH_BITS = np.uint16(sum(WORDS))
@@ -154,7 +154,7 @@ class RecordedHealthReader:
 
         The bag is read from its beginning.
         """
-        if self._topic not in self._bag.list_topics(STRESS):
+        if self._topic not in self._bag.list_topics(STRESS_TYPE):
             return
         names = ("cube", "sequence", "left_out", "status")
         for columns in self._bag.read_columns(self._topic, stress_codec, names):

@@ -21,7 +21,7 @@ from ..core.reconstructor import Reconstructor, RecordedHealth
 from ..core.rows import FrequencyRows, StressRows
 from ..core.tensor import rpy_from_quaternion
 from ..messages.skin_info import read_cube_calibrations, read_cube_poses, read_skin_elastomer
-from ..messages.types import INFO
+from ..messages.types import INFO_TYPE
 from .read import Bag, read_stamp_ns
 from .recorded_compensation import CompensationReader
 from .recorded_health import RecordedHealthReader
@@ -163,7 +163,7 @@ def find_skin_infos(bag: Bag, topic: str) -> list[SkinInfo]:
     try:
         infos = bag.read_infos(f"{skin}info")
     except BagError:
-        if driver_topic not in bag.list_topics(INFO):
+        if driver_topic not in bag.list_topics(INFO_TYPE):
             raise
         infos = bag.read_infos(driver_topic)
     reconstructed = [info for info in infos if info.sender == "reconstruction"]

@@ -17,7 +17,7 @@ from ..core.errors import BagError
 from ..core.reconstructor import RecordedHealth
 from ..core.rows import FrequencyRows
 from ..messages.codec import Decoded
-from ..messages.types import FREQUENCIES
+from ..messages.types import FREQUENCIES_TYPE
 from .read import Bag
 from .recorded_compensation import RecordedCompensation
 from .recording import Recording
@@ -235,7 +235,7 @@ def open_bag(path: Path | str, topic: str | None = None) -> BagSource:
     # The returned source closes the bag. If an error occurs before, the bag is closed here.
     bag = Bag(Path(path))
     try:
-        topics = bag.list_topics(FREQUENCIES)
+        topics = bag.list_topics(FREQUENCIES_TYPE)
         if topic is None:
             topic = f"{bag.find_skin_prefix()}frequencies"
         elif topic not in topics:

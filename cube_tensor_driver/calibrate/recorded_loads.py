@@ -22,7 +22,7 @@ from ..core.modes import COMPONENTS, STRESS
 from ..core.rows import concatenate
 from ..core.symmetry import choose_default_modes
 from ..messages.codec import SECOND
-from ..messages.types import STRESS as BATCH_TYPE
+from ..messages.types import STRESS_TYPE
 from .fit import loads_from_forces
 from .load_table import Loads
 
@@ -223,7 +223,7 @@ def _read_reference(
     """
     types = {one.topic: one.msgtype for one in bag.connections}
     msgtype = types.get(topic)
-    if msgtype == BATCH_TYPE:
+    if msgtype == STRESS_TYPE:
         stamp_ns, values = _read_batches(bag, topic, number)
     elif msgtype in (WRENCH_TYPE, TENSOR_TYPE):
         entries = bag.read_decoded({topic})

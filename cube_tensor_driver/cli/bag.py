@@ -74,7 +74,7 @@ def show_bag(path: Path) -> None:
 
     from ..bags.read import Bag
     from ..bags.summary import find_last_diagnostics
-    from ..messages.types import FREQUENCIES
+    from ..messages.types import FREQUENCIES_TYPE
     from ..views.terminal.output import say
 
     with Bag(path) as bag:
@@ -89,7 +89,7 @@ def show_bag(path: Path) -> None:
             say(f"{path}: no messages")
 
         show_topics(bag, duration_s)
-        for topic in bag.list_topics(FREQUENCIES):
+        for topic in bag.list_topics(FREQUENCIES_TYPE):
             show_skin(bag, topic)
         for status in find_last_diagnostics(bag):
             say(format_diagnostics(status))

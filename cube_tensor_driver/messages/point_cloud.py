@@ -14,7 +14,7 @@ import numpy as np
 
 from ..core.arrays import Array
 from .codec import SECOND
-from .types import TRACTION
+from .types import TRACTION_TYPE
 
 Message = TypeVar("Message")
 
@@ -57,7 +57,7 @@ def make_cloud_message(
     ]
     step = FLOAT32_SIZE * len(fields)
     return make(
-        TRACTION,
+        TRACTION_TYPE,
         header=make_header(make, stamp_ns, frame_id),
         height=1,
         width=len(points),

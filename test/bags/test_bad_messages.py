@@ -20,7 +20,7 @@ from cube_tensor_driver.bags.reprocess.job import ReprocessJob, reprocess
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.core.errors import BagError
-from cube_tensor_driver.messages.types import FREQUENCIES, INFO
+from cube_tensor_driver.messages.types import FREQUENCIES_TYPE, INFO_TYPE
 
 SKIN = find_package_data() / "config" / "skin_demo.yaml"
 MESSAGES = 30
@@ -100,12 +100,12 @@ def stress_bytes(path: Path, folder: Path) -> list[bytes]:
     [
         ("/info", no_utf8),
         ("/info", cut),
-        ("/info", changed(INFO, without_rest)),
-        ("/info", changed(INFO, without_calibrations)),
-        ("/info", changed(INFO, of_version_9)),
+        ("/info", changed(INFO_TYPE, without_rest)),
+        ("/info", changed(INFO_TYPE, without_calibrations)),
+        ("/info", changed(INFO_TYPE, of_version_9)),
         ("/frequencies", cut),
-        ("/frequencies", changed(FREQUENCIES, with_a_pad_less)),
-        ("/frequencies", changed(FREQUENCIES, with_longer_columns)),
+        ("/frequencies", changed(FREQUENCIES_TYPE, with_a_pad_less)),
+        ("/frequencies", changed(FREQUENCIES_TYPE, with_longer_columns)),
         ("/stress", cut),
     ],
 )
@@ -124,7 +124,7 @@ def test_without_any_good_info_that_of_the_driver_counts(bag, tmp_path):
     with Bag(bag) as source, BagWriter(path) as writer:
         for one in source.connections:
             writer.add_topic(one.topic, one.msgtype, one.qos)
-        writer.add_topic("/driver/info", INFO)
+        writer.add_topic("/driver/info", INFO_TYPE)
         for entry in source.read_entries():
             if entry.topic == "/info":
                 writer.write("/driver/info", entry.time_ns, entry.data)
@@ -139,7 +139,7 @@ def test_a_bag_without_any_good_message_says_why(bag, tmp_path):
         for one in source.connections:
             writer.add_topic(one.topic, one.msgtype, one.qos)
         for entry in source.read_entries():
-            damage = changed(FREQUENCIES, with_a_pad_less)
+            damage = changed(FREQUENCIES_TYPE, with_a_pad_less)
             is_bad = entry.topic == "/frequencies"
             writer.write(entry.topic, entry.time_ns, damage(entry.data) if is_bad else entry.data)
     with pytest.raises(BagError, match=r"bad: /frequencies: .*shape"):

@@ -28,7 +28,7 @@ from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import StressRows, concatenate
 from cube_tensor_driver.core.status import STUCK
 from cube_tensor_driver.messages.codec import frequency_codec
-from cube_tensor_driver.messages.types import FREQUENCIES, INFO
+from cube_tensor_driver.messages.types import FREQUENCIES_TYPE, INFO_TYPE
 
 SKIN = find_package_data() / "config" / "skin_demo.yaml"
 MESSAGES = 200
@@ -147,15 +147,15 @@ def test_messages_whose_scans_would_join_come_one_by_one(tmp_path):
     pipeline = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
     store = make_typestore()
     with BagWriter(tmp_path / "bag") as writer:
-        for topic, kind in (("/frequencies", FREQUENCIES), ("/info", INFO)):
+        for topic, kind in (("/frequencies", FREQUENCIES_TYPE), ("/info", INFO_TYPE)):
             writer.add_topic(topic, kind)
         info = info_of(skin, pipeline, START_NS)
-        writer.write("/info", START_NS, bytes(store.serialize_cdr(info, INFO)))
+        writer.write("/info", START_NS, bytes(store.serialize_cdr(info, INFO_TYPE)))
         for k in range(6):
             stamp_ns = START_NS + 10_000_000 * k
             raw = frequencies_of(k, stamp_ns, loads(pipeline, 0.01 * k)[[1, 2, 0]])
             raw.cube[:] = [1, 2, 0] if k < 4 else [4, 5, 6]
-            data = bytes(store.serialize_cdr(raw, FREQUENCIES))
+            data = bytes(store.serialize_cdr(raw, FREQUENCIES_TYPE))
             writer.write("/frequencies", stamp_ns, data)
     with open_bag(tmp_path / "bag") as source:
         assert [rows.cube.tolist() for rows in source] == [[1, 2, 0]] * 4 + [[4, 5, 6] * 2]
@@ -168,18 +168,20 @@ def test_what_is_wrong_is_said(bag, tmp_path):
         open_bag(bag, "/other/frequencies")
     with BagWriter(tmp_path / "two") as writer:
         for name in "ab":
-            writer.add_topic(f"/{name}/frequencies", FREQUENCIES)
+            writer.add_topic(f"/{name}/frequencies", FREQUENCIES_TYPE)
     with pytest.raises(BagError, match="2 topics"):
         open_bag(tmp_path / "two")
     with BagWriter(tmp_path / "bare") as writer:
-        writer.add_topic("/frequencies", FREQUENCIES)
+        writer.add_topic("/frequencies", FREQUENCIES_TYPE)
         row = frequencies_of(0, START_NS, np.full((1, 8), 1e5))
         writer.write(
-            "/frequencies", START_NS, bytes(make_typestore().serialize_cdr(row, FREQUENCIES))
+            "/frequencies", START_NS, bytes(make_typestore().serialize_cdr(row, FREQUENCIES_TYPE))
         )
     with pytest.raises(BagError, match="no message on /info"):
         open_bag(tmp_path / "bare")
     assert (
-        frequency_codec.decode(bytes(make_typestore().serialize_cdr(row, FREQUENCIES))).rows.cube
+        frequency_codec.decode(
+            bytes(make_typestore().serialize_cdr(row, FREQUENCIES_TYPE))
+        ).rows.cube
         == 0
     )

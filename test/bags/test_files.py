@@ -56,7 +56,7 @@ from cube_tensor_driver.core.oscillator import compute_pad_frequency
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
 from cube_tensor_driver.core.status import PAD_FAULT, STAMP, STUCK
-from cube_tensor_driver.messages.types import FREQUENCIES, INFO, STRESS
+from cube_tensor_driver.messages.types import FREQUENCIES_TYPE, INFO_TYPE, STRESS_TYPE
 
 SKIN = find_package_data() / "config" / "skin_demo.yaml"
 KEPT = ROOT / "test" / "data" / "bag"
@@ -137,9 +137,9 @@ def test_a_written_bag_is_read_by_rosbag2(tmp_path, options):
         one.name: (one.type, one.type_description_hash) for one in reader.get_all_topics_and_types()
     }
     assert {one.topic_type for one in reader.get_all_message_definitions()} >= {
-        FREQUENCIES,
-        STRESS,
-        INFO,
+        FREQUENCIES_TYPE,
+        STRESS_TYPE,
+        INFO_TYPE,
     }
     with Bag(path) as bag:
         assert messages == [
@@ -227,7 +227,7 @@ def test_type_hashes_are_those_of_ros():
     """rosbags' reading of our message files is the one that ROS generated code from."""
     pytest.importorskip("rclpy")
     installed = Path(os.environ["AMENT_PREFIX_PATH"].split(":")[0]) / "share/cube_tensor_driver/msg"
-    for kind in (FREQUENCIES, STRESS, INFO):
+    for kind in (FREQUENCIES_TYPE, STRESS_TYPE, INFO_TYPE):
         text = (installed / f"{kind.split('/')[-1]}.json").read_text()
         assert make_typestore().hash_rihs01(kind) in text
 
@@ -263,7 +263,7 @@ def test_tare_in_the_middle_counts_from_its_time_on(tmp_path):
     tared.rest_frequency = pipeline.rest_frequency * 1.001
     store, middle = make_typestore(), START_NS + 500_000_000
     with BagWriter(tmp_path / "bag") as writer:
-        for topic, kind in (("/frequencies", FREQUENCIES), ("/info", INFO)):
+        for topic, kind in (("/frequencies", FREQUENCIES_TYPE), ("/info", INFO_TYPE)):
             writer.add_topic(topic, kind)
         for of, stamp, sender in (
             (pipeline, START_NS, "reconstruction"),
@@ -271,14 +271,16 @@ def test_tare_in_the_middle_counts_from_its_time_on(tmp_path):
             (pipeline, middle + 1, "driver"),
         ):
             writer.write(
-                "/info", stamp, bytes(store.serialize_cdr(info_of(skin, of, stamp, sender), INFO))
+                "/info",
+                stamp,
+                bytes(store.serialize_cdr(info_of(skin, of, stamp, sender), INFO_TYPE)),
             )
         for k in range(100):
             raw = frequencies_of(k, START_NS + 10_000_000 * k, loads(pipeline, 0.01 * k))
             writer.write(
                 "/frequencies",
                 START_NS + 10_000_000 * k,
-                bytes(store.serialize_cdr(raw, FREQUENCIES)),
+                bytes(store.serialize_cdr(raw, FREQUENCIES_TYPE)),
             )
     reprocess(ReprocessJob(tmp_path / "bag", tmp_path / "out", "bag"))
     for k, record in enumerate(stress(tmp_path / "out").values()):
@@ -599,11 +601,11 @@ def test_another_version_is_refused(tmp_path):
     skin = read_skin(SKIN)
     pipeline = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
     with BagWriter(tmp_path / "bag") as writer:
-        writer.add_topic("/info", INFO)
+        writer.add_topic("/info", INFO_TYPE)
         writer.write(
             "/info",
             1,
-            bytes(make_typestore().serialize_cdr(info_of(skin, pipeline, 1, version=7), INFO)),
+            bytes(make_typestore().serialize_cdr(info_of(skin, pipeline, 1, version=7), INFO_TYPE)),
         )
     with Bag(tmp_path / "bag") as bag, pytest.raises(BagError, match="/info has version 7; this"):
         bag.read_infos("/info")
@@ -612,10 +614,12 @@ def test_another_version_is_refused(tmp_path):
     with old.open("wb") as file:
         library = mcap.writer.Writer(file)
         library.start("ros2")
-        schema = library.register_schema(FREQUENCIES, "ros2msg", b"uint16[] cube\nuint8 n_pads\n")
+        schema = library.register_schema(
+            FREQUENCIES_TYPE, "ros2msg", b"uint16[] cube\nuint8 n_pads\n"
+        )
         library.add_message(library.register_channel("/frequencies", "cdr", schema), 1, b"", 1)
         library.finish()
-    with pytest.raises(BagError, match=f"another definition of {FREQUENCIES}; this") as caught:
+    with pytest.raises(BagError, match=f"another definition of {FREQUENCIES_TYPE}; this") as caught:
         Bag(old)
     assert "\n" not in str(caught.value)
 
@@ -647,8 +651,8 @@ def test_fit_from_a_bag(tmp_path, capsys):
 
     with BagWriter(tmp_path / "bag") as writer:
         for topic, of in (
-            ("/frequencies", FREQUENCIES),
-            ("/info", INFO),
+            ("/frequencies", FREQUENCIES_TYPE),
+            ("/info", INFO_TYPE),
             ("/force", WRENCH),
             ("/known", kind),
         ):

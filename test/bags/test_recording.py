@@ -35,7 +35,7 @@ from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.cli.main import main
 from cube_tensor_driver.config.package_data import find_package_data
 from cube_tensor_driver.core.errors import BagError
-from cube_tensor_driver.messages.types import FREQUENCIES, INFO, STRESS
+from cube_tensor_driver.messages.types import FREQUENCIES_TYPE, INFO_TYPE, STRESS_TYPE
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, list_skin_processes
@@ -110,7 +110,7 @@ def frequency_stamps(bag: Path, copy: Path | None = None) -> list[int]:
             return []
         bag = copy
     with Bag(bag) as opened:
-        if "/frequencies" not in opened.list_topics(FREQUENCIES):
+        if "/frequencies" not in opened.list_topics(FREQUENCIES_TYPE):
             return []
         return [
             int(stamp)
@@ -293,7 +293,7 @@ class Publishers:
     def get_publishers_info_by_topic(self, topic: str) -> list[object]:
         if topic not in self.connected:
             return []
-        kinds = {"/stress": STRESS, "/frequencies": FREQUENCIES, "/info": INFO}
+        kinds = {"/stress": STRESS_TYPE, "/frequencies": FREQUENCIES_TYPE, "/info": INFO_TYPE}
         profile = LATCHED if topic == "/info" else QoSProfile(depth=10)
         return [SimpleNamespace(topic_type=kinds[topic], qos_profile=profile)]
 
@@ -555,5 +555,5 @@ def test_types_of_the_bag_are_offered_as_they_were(ros, tmp_path):
     )
     offered = ros.node.get_publishers_info_by_topic("/info")[0]
     assert offered.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
-    assert ros.node.get_publishers_info_by_topic("/frequencies")[0].topic_type == FREQUENCIES
+    assert ros.node.get_publishers_info_by_topic("/frequencies")[0].topic_type == FREQUENCIES_TYPE
     assert player.communicate(timeout=20) and player.returncode == 0

@@ -32,7 +32,7 @@ from cube_tensor_driver.core.errors import FitError
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows
-from cube_tensor_driver.messages.types import FREQUENCIES, INFO
+from cube_tensor_driver.messages.types import FREQUENCIES_TYPE, INFO_TYPE
 from cube_tensor_driver.simulation.cubes import PadErrors, SimulatedCubes
 from cube_tensor_driver.simulation.imperfections import Imperfections
 
@@ -184,10 +184,10 @@ def test_three_commands_lead_from_a_bag_to_a_calibration(tmp_path, capsys, base)
     )
     bag, saved = tmp_path / "press", tmp_path / "mine.yaml"
     with BagWriter(bag) as writer:
-        for name, kind in {"info": INFO, "frequencies": FREQUENCIES}.items():
+        for name, kind in {"info": INFO_TYPE, "frequencies": FREQUENCIES_TYPE}.items():
             writer.add_topic(f"/{name}", kind, [describe_quality(latched=name == "info")])
         info = info_of(skin, Pipeline([base]), START_NS)
-        writer.write("/info", START_NS, bytes(make_typestore().serialize_cdr(info, INFO)))
+        writer.write("/info", START_NS, bytes(make_typestore().serialize_cdr(info, INFO_TYPE)))
         for n, pads in enumerate(frequency.astype(np.float32)):
             stamp_ns = START_NS + n * 100_000_000
             number = np.zeros(1, np.uint16)

@@ -30,7 +30,7 @@ from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.core.status import COMPENSATION, THERMAL
-from cube_tensor_driver.messages.types import FREQUENCIES, INFO
+from cube_tensor_driver.messages.types import FREQUENCIES_TYPE, INFO_TYPE
 from cube_tensor_driver.simulation.cubes import PadErrors, SimulatedCubes
 from cube_tensor_driver.simulation.imperfections import Imperfections
 from cube_tensor_driver.touch.contact_finder import ContactSettings, make_contact_finder
@@ -79,10 +79,10 @@ def make_bag(folder, knots, faces="both", seconds=600.0, measured=True, base=CUB
     )
     store = make_typestore()
     with BagWriter(folder) as writer:
-        for topic, kind in (("info", INFO), ("frequencies", FREQUENCIES)):
+        for topic, kind in (("info", INFO_TYPE), ("frequencies", FREQUENCIES_TYPE)):
             writer.add_topic(f"/{topic}", kind, [describe_quality(latched=topic == "info")])
         info = info_of(skin, Pipeline([base] * N_CUBES), START_NS)
-        writer.write("/info", START_NS, bytes(store.serialize_cdr(info, INFO)))
+        writer.write("/info", START_NS, bytes(store.serialize_cdr(info, INFO_TYPE)))
         times = np.arange(0.0, seconds, 0.5)
         cubes = simulated(knots, faces, None)
         for rows in play(cubes, times, np.zeros(6)):

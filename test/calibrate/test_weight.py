@@ -33,8 +33,7 @@ from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.core.status import COMPENSATION, WEIGHT
-from cube_tensor_driver.messages.types import COMPENSATION as COMPENSATION_TYPE
-from cube_tensor_driver.messages.types import FREQUENCIES, INFO
+from cube_tensor_driver.messages.types import COMPENSATION_TYPE, FREQUENCIES_TYPE, INFO_TYPE
 from cube_tensor_driver.simulation.imperfections import Imperfections
 from cube_tensor_driver.simulation.motion import read_weight
 from cube_tensor_driver.simulation.source import simulate
@@ -90,14 +89,14 @@ def make_bag(folder, poses=POSES, spread=0.0, cubes=3, motion=True, **changes):
 def write_bag(folder, skin, scans, motion=True):
     """A bag of scans from the time 0 on, with the specific force of their first cube."""
     store = make_typestore()
-    topics = {"info": INFO, "frequencies": FREQUENCIES}
+    topics = {"info": INFO_TYPE, "frequencies": FREQUENCIES_TYPE}
     if motion:
         topics["compensation"] = COMPENSATION_TYPE
     with BagWriter(folder) as writer:
         for topic, kind in topics.items():
             writer.add_topic(f"/{topic}", kind, [describe_quality(latched=topic == "info")])
         info = info_of(skin, Pipeline([cube.calibration for cube in skin.cubes]), START_NS)
-        writer.write("/info", START_NS, bytes(store.serialize_cdr(info, INFO)))
+        writer.write("/info", START_NS, bytes(store.serialize_cdr(info, INFO_TYPE)))
         for rows in scans:
             stamps = rows.stamp_ns + START_NS
             stamp_ns = int(stamps[0])

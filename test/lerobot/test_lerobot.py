@@ -31,7 +31,7 @@ from cube_tensor_driver.core.modes import COMPONENTS
 from cube_tensor_driver.core.rows import StressRows
 from cube_tensor_driver.lerobot.statistics import describe, summarise
 from cube_tensor_driver.lerobot.windows import TACTILE, stream_windows
-from cube_tensor_driver.messages.types import INFO
+from cube_tensor_driver.messages.types import INFO_TYPE
 
 SKIN = find_package_data() / "config" / "skin_demo.yaml"
 FPS = 30
@@ -401,7 +401,7 @@ def test_what_does_not_fit_is_refused_in_one_line(
 
 def test_a_bag_without_frequencies_is_refused_in_one_line(tmp_path, capsys):
     with BagWriter(tmp_path / "bag") as writer:
-        writer.add_topic("/info", INFO)
+        writer.add_topic("/info", INFO_TYPE)
     command = ["export", "lerobot", str(tmp_path / "bag"), "-o", str(tmp_path / "out")]
     assert main([*command, "--fps", "30"]) == 1
     assert "record frequencies and info" in capsys.readouterr().err

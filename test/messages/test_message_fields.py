@@ -33,7 +33,7 @@ from cube_tensor_driver.messages.contacts import (
     make_traction_message,
 )
 from cube_tensor_driver.messages.skin_info import read_skin_elastomer
-from cube_tensor_driver.messages.types import CONTACTS
+from cube_tensor_driver.messages.types import CONTACTS_TYPE
 from cube_tensor_driver.touch.slip import SLIP, STICK, UNKNOWN, Slip
 from cube_tensor_driver.touch.surface import Contact
 from cube_tensor_driver.touch.tracker.contact_tracker import TrackedContact
@@ -231,7 +231,7 @@ def test_each_number_of_a_contact_is_in_its_field(kind):
     touches = np.array([START_NS, -1, START_NS + 1])
 
     def sent(*values):
-        return make_typestore().deserialize_cdr(encode_contacts(*values), CONTACTS)
+        return make_typestore().deserialize_cdr(encode_contacts(*values), CONTACTS_TYPE)
 
     message = sent(START_NS + 5, "wrist", contacts, slip, touches)
     assert message.header.frame_id == "wrist"

@@ -44,7 +44,12 @@ from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.mechanics.influence import read_influence
 from cube_tensor_driver.messages.contacts import CLOUD
-from cube_tensor_driver.messages.types import COMPENSATION, FREQUENCIES, INFO, STRESS
+from cube_tensor_driver.messages.types import (
+    COMPENSATION_TYPE,
+    FREQUENCIES_TYPE,
+    INFO_TYPE,
+    STRESS_TYPE,
+)
 from cube_tensor_driver.simulation.motion import read_weight
 from cube_tensor_driver.touch.contact_finder import ContactSettings
 
@@ -110,10 +115,10 @@ def read_stamp_ns(data: bytes) -> int:
 def write_bag(folder: Path, recorded: dict[str, list[bytes]]) -> Path:
     """A bag of serialised messages by topic, each recorded at its stamp."""
     kinds = {
-        "info": INFO,
-        "frequencies": FREQUENCIES,
-        "stress": STRESS,
-        "compensation": COMPENSATION,
+        "info": INFO_TYPE,
+        "frequencies": FREQUENCIES_TYPE,
+        "stress": STRESS_TYPE,
+        "compensation": COMPENSATION_TYPE,
     }
     entries = [(read_stamp_ns(data), name, data) for name in recorded for data in recorded[name]]
     with BagWriter(folder) as writer:

@@ -37,8 +37,12 @@ from cube_tensor_driver.core.rows import FrequencyRows, concatenate
 from cube_tensor_driver.core.status import COMPENSATION, CREEP, THERMAL, WEIGHT
 from cube_tensor_driver.core.tensor import rotation_from_rpy
 from cube_tensor_driver.messages.codec import stress_codec
-from cube_tensor_driver.messages.types import COMPENSATION as COMPENSATION_TYPE
-from cube_tensor_driver.messages.types import FREQUENCIES, INFO, STRESS
+from cube_tensor_driver.messages.types import (
+    COMPENSATION_TYPE,
+    FREQUENCIES_TYPE,
+    INFO_TYPE,
+    STRESS_TYPE,
+)
 from cube_tensor_driver.msg import SkinCompensation, SkinStress
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import SimulatedHubs, list_skin_processes
@@ -300,7 +304,7 @@ def decode_compensation(node) -> list[SkinCompensation]:
 
 def write_bag(folder, node, rows: FrequencyRows, dropped: range) -> None:
     """What a recorder keeps of a node, without some messages of compensation."""
-    topics = {"info": INFO, "frequencies": FREQUENCIES, "stress": STRESS}
+    topics = {"info": INFO_TYPE, "frequencies": FREQUENCIES_TYPE, "stress": STRESS_TYPE}
     topics["compensation"] = COMPENSATION_TYPE
     scans = [rows.select(slice(k, k + 2)) for k in range(0, len(rows), 2)]
     frequencies = [encoded(scan, b"tool\0") for scan in scans]

@@ -26,7 +26,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 
 from cube_tensor_driver.bags.read import Bag
 from cube_tensor_driver.config.package_data import find_package_data
-from cube_tensor_driver.messages.types import STRESS
+from cube_tensor_driver.messages.types import STRESS_TYPE
 from cube_tensor_driver.processes.children import format_ros_arguments
 from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, list_skin_processes
 from cube_tensor_driver.simulation.sample_log import SampleLog
@@ -147,7 +147,7 @@ def wait(done: Callable[[], object], seconds: float = 60.0) -> None:
 def rows(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Cube, sequence and time of arrival (ns) of all rows of `stress`."""
     with Bag(path) as bag:
-        (topic,) = bag.list_topics(STRESS)
+        (topic,) = bag.list_topics(STRESS_TYPE)
         messages = [(message, time_ns) for time_ns, message in bag.read_decoded({topic})]
     cube, sequence = (
         np.concatenate([getattr(one, name) for one, _ in messages]) for name in ("cube", "sequence")

@@ -20,7 +20,7 @@ from ...messages.skin_info import (
     read_skin_elastomer,
 )
 from ...messages.touch import encode_touch
-from ...messages.types import CONTACTS, TOUCH, TRACTION
+from ...messages.types import CONTACTS_TYPE, TOUCH_TYPE, TRACTION_TYPE
 from ...touch.contact_finder import ContactSettings, make_contact_finder
 from ...touch.touch_detection import NO_TOUCHES, Touch, Touches
 from ..metadata import describe_quality
@@ -71,11 +71,11 @@ class ContactWriter:
         self._contacts = f"{topics}contacts"
         self._traction = f"{topics}traction"
         self._touches = f"{topics}touch"
-        writer.add_topic(self._touches, TOUCH, [describe_quality()])
-        writer.add_topic(self._contacts, CONTACTS, [describe_quality()])
+        writer.add_topic(self._touches, TOUCH_TYPE, [describe_quality()])
+        writer.add_topic(self._contacts, CONTACTS_TYPE, [describe_quality()])
         writer.add_topic(
             self._traction,
-            TRACTION,
+            TRACTION_TYPE,
             [describe_quality(depth=2)],
         )
         self._info: SkinInfo | None = None
@@ -201,5 +201,5 @@ class ContactWriter:
             self._writer.write(
                 self._traction,
                 recorded_ns,
-                serialise(TRACTION, message),
+                serialise(TRACTION_TYPE, message),
             )

@@ -25,7 +25,7 @@ from ...core.pipeline import Pipeline
 from ...core.reconstructor import Reconstructor
 from ...core.rows import StressRows
 from ...messages.codec import stress_codec
-from ...messages.types import FREQUENCIES, INFO, STRESS
+from ...messages.types import FREQUENCIES_TYPE, INFO_TYPE, STRESS_TYPE
 from ..metadata import describe_quality
 from ..read import Bag, read_stamp_ns, serialise
 from ..recording import Settings, reconstruct_rows
@@ -246,9 +246,9 @@ def _reprocess(
         job: Output format, overrides and options of contacts.
         output: Folder or file to write, which is renamed when it is complete.
     """
-    topics = bag.list_topics(FREQUENCIES)
+    topics = bag.list_topics(FREQUENCIES_TYPE)
     if not topics:
-        raise BagError(f"{job.bag}: no topic of {FREQUENCIES}; record frequencies and info")
+        raise BagError(f"{job.bag}: no topic of {FREQUENCIES_TYPE}; record frequencies and info")
     if job.form != "bag" and len(topics) > 1:
         raise BagError(
             f"{job.bag}: {len(topics)} skins ({', '.join(topics)}); a table holds one: write a bag"
@@ -289,15 +289,15 @@ def _write_skin(
     """
     bag, skin = source.bag, source.topic.removesuffix("frequencies")
     settings = choose_settings(source, job.overrides)
-    writer.add_topic(f"{skin}info", INFO, [describe_quality(latched=True)])
-    writer.add_topic(f"{skin}stress", STRESS, [describe_quality()])
+    writer.add_topic(f"{skin}info", INFO_TYPE, [describe_quality(latched=True)])
+    writer.add_topic(f"{skin}stress", STRESS_TYPE, [describe_quality()])
     infos = list(_replace_settings(source.recording.infos, settings))
     for info in infos:
         # A SkinInfo message can be stamped before or after the recording. It is written at a time
         # within the recording, so that the output has the same start and end.
         inside_ns = min(bag.end_ns, read_stamp_ns(info))
         inside_ns = max(bag.start_ns, inside_ns)
-        writer.write(f"{skin}info", inside_ns, serialise(INFO, info))
+        writer.write(f"{skin}info", inside_ns, serialise(INFO_TYPE, info))
 
     contacts = None
     if job.contacts is not None:

@@ -86,7 +86,7 @@ The shift is measured from the mean frequency at the time at which the cube came
 """
 
 
-SHOWN = OPEN | SHORT | RANGE | REPORTED
+SINGLE_ROW_CONDITIONS = OPEN | SHORT | RANGE | REPORTED
 """Conditions of a pad, as a bit mask, that a single row (sample of a cube) shows: open, short, out
 of range, reported by the device. All others need the statistics of a window of 0.5 s."""
 
@@ -131,7 +131,7 @@ class Conditions:
         """
         cubes = self._sums.cubes
         present = self._recent[0]
-        is_first = present[cube] & SHOWN == 0
+        is_first = present[cube] & SINGLE_ROW_CONDITIONS == 0
         new_bits = np.where(is_first, bits, 0)
         present[cube] |= new_bits
         pads = pack_bits(bits > 0)

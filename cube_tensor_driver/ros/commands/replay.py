@@ -20,7 +20,7 @@ from ...bags.metadata import Connection
 from ...bags.read import Bag, Entry
 from ...core.errors import BagError
 from ...messages.codec import SECOND
-from ...messages.types import COMPENSATION, FREQUENCIES, PACKAGE, STRESS, TOUCH
+from ...messages.types import COMPENSATION_TYPE, FREQUENCIES_TYPE, PACKAGE, STRESS_TYPE, TOUCH_TYPE
 from ...msg import ReplayState
 from ...processes.stop_signals import on_stop_signal
 from ...srv import SteerReplay
@@ -67,9 +67,9 @@ STATE_PERIOD_S = 0.1
 """Time, in seconds, between two messages on `~/state`, the state of the player."""
 
 RECONSTRUCTED_TYPES = (
-    STRESS,
-    TOUCH,
-    COMPENSATION,
+    STRESS_TYPE,
+    TOUCH_TYPE,
+    COMPENSATION_TYPE,
     f"{PACKAGE}/msg/StressTensorStamped",
     "geometry_msgs/msg/WrenchStamped",
 )
@@ -133,7 +133,7 @@ class Player:
         self._publishers: dict[str, Publisher] = {}
         self._latched: set[str] = set()
         # A bag may contain several skins in different namespaces; each has a topic `frequencies`.
-        skins = [topic.removesuffix("frequencies") for topic in bag.list_topics(FREQUENCIES)]
+        skins = [topic.removesuffix("frequencies") for topic in bag.list_topics(FREQUENCIES_TYPE)]
         for connection in bag.connections:
             topic = connection.topic
             is_chosen = stress or not _is_reconstructed(connection, skins)
