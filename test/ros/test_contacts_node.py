@@ -242,9 +242,9 @@ def test_contacts_of_an_uncertain_compensation_live_and_out_of_a_bag(ros, tmp_pa
     """Reconstruction and contacts as nodes, and reprocessing of what they published, give the same
     but for rounding, which depends on the process.
 
-    Under load, the motion of the skin is unknown. Because the errors that this causes are stated, the
-    weak load is found, which without them had to exceed 1.2 kPa. Method and elastomer come from the skin file.
-    Settings that state all of it give the same.
+    Under load, the motion of the skin is unknown. Because the errors that this causes are stated,
+    the weak load is found, which without them had to exceed 1.2 kPa. Method and elastomer come from
+    the skin file. Settings that state all of it give the same.
     """
     pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
     from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -326,8 +326,8 @@ def test_contacts_of_an_uncertain_compensation_live_and_out_of_a_bag(ros, tmp_pa
             for _ in range(SCANS):
                 middle = middle + np.array([SHIFT, 0])
                 scans.append(frequencies(skin, force, middle))
-        # The node was ready later than the first scan, with which reprocessing begins. In the gap, the
-        # samples of the IMU become too old, so that both get much larger errors.
+        # The node was ready later than the first scan, with which reprocessing begins. In the gap,
+        # the samples of the IMU become too old, so that both get much larger errors.
         begin_ns, due_ns = now_ns + GAP_NS, 0
         for number, hertz in enumerate(scans):
             send(hertz, STEP_NS if number else GAP_NS)
