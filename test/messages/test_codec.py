@@ -13,14 +13,14 @@ import pytest
 
 pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 
-from bag_maker import FREQUENCIES, STRESS, header, message
+from bag_maker import FREQUENCIES_TYPE, STRESS_TYPE, header, message
 
 from cube_tensor_driver.bags.metadata import make_typestore
 from cube_tensor_driver.core.errors import MessageError
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
 from cube_tensor_driver.messages.codec import frequency_codec, stress_codec
 
-CODECS = {FREQUENCIES: frequency_codec, STRESS: stress_codec}
+CODECS = {FREQUENCIES_TYPE: frequency_codec, STRESS_TYPE: stress_codec}
 FRAMES = ("", "a", "skin", "skin_base")
 STAMP_NS = 1_700_000_000_123_456_789
 
@@ -29,7 +29,7 @@ def rows_of(kind: str, n: int, pads: int = 8) -> FrequencyRows | StressRows:
     """Random bits in every field, but times behind STAMP_NS."""
     random = np.random.default_rng(n)
     widths = {"frequency": pads, "stress": 6, "gradient": 9}
-    cls = FrequencyRows if kind == FREQUENCIES else StressRows
+    cls = FrequencyRows if kind == FREQUENCIES_TYPE else StressRows
     types = {
         "cube": "u2",
         "sequence": "u4",
@@ -55,7 +55,7 @@ def counts_at(kind: str, n: int, pads: int = 8) -> dict[str, int]:
     """Where the length of each sequence stands in a message with the frame id "skin"."""
     head = "cube:2 sequence:4 time_offset:4"
     fields = f"{head} n_pads frequency:4 temperature:4 pad_fault:4 status:2"
-    if kind == STRESS:
+    if kind == STRESS_TYPE:
         fields = f"{head} stress:24 gradient:36 residual:4 status:2 observed:2 left_out:4"
     places, at = {"frame_id": 12}, 16 + 5
     for field in fields.split():
@@ -72,7 +72,7 @@ def counts_at(kind: str, n: int, pads: int = 8) -> dict[str, int]:
 def by_rosbags(kind: str, rows: FrequencyRows | StressRows, frame_id: str) -> bytes:
     fields = {name: column.ravel() for name, column in rows.collect_columns().items()}
     fields["time_offset"] = (fields.pop("stamp_ns") - STAMP_NS).astype(np.int32)
-    if kind == FREQUENCIES:
+    if kind == FREQUENCIES_TYPE:
         fields["n_pads"] = rows.frequency.shape[1]
     one = message(kind, header=header(STAMP_NS, frame_id), **fields)
     return bytes(make_typestore().serialize_cdr(one, kind))
@@ -85,7 +85,7 @@ def assert_equal(one: FrequencyRows | StressRows, other: FrequencyRows | StressR
         assert a.tobytes() == b.tobytes(), name
 
 
-@pytest.mark.parametrize("kind", [FREQUENCIES, STRESS])
+@pytest.mark.parametrize("kind", [FREQUENCIES_TYPE, STRESS_TYPE])
 @pytest.mark.parametrize("frame_id", FRAMES)
 @pytest.mark.parametrize("n", [0, 1, 3, 64])
 def test_bytes_are_those_of_rosbags_both_ways(kind, frame_id, n):
@@ -103,7 +103,7 @@ def joined(*messages: bytes) -> np.ndarray:
     return np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), -1)
 
 
-@pytest.mark.parametrize("kind", [FREQUENCIES, STRESS])
+@pytest.mark.parametrize("kind", [FREQUENCIES_TYPE, STRESS_TYPE])
 def test_several_messages_are_decoded_and_encoded_together(kind):
     codec = CODECS[kind]
     each = [rows_of(kind, 5) for _ in range(3)]
@@ -118,7 +118,7 @@ def test_several_messages_are_decoded_and_encoded_together(kind):
 def test_a_buffer_is_filled_again_and_again():
     buffer = stress_codec.make_buffer(b"skin\0", 4)
     for n in (4, 4):
-        rows = rows_of(STRESS, n)
+        rows = rows_of(STRESS_TYPE, n)
         for name in stress_codec.columns:
             getattr(buffer.rows, name)[:] = getattr(rows, name)
         assert_equal(stress_codec.decode(buffer.encode()).rows, rows)
@@ -129,12 +129,12 @@ def test_a_buffer_is_filled_again_and_again():
     assert read.rows.status.tolist() == [3] * 4 and read.stamp_ns.tolist() == [STAMP_NS + 4]
 
 
-@pytest.mark.parametrize("kind", [FREQUENCIES, STRESS])
+@pytest.mark.parametrize("kind", [FREQUENCIES_TYPE, STRESS_TYPE])
 def test_every_count_that_contradicts_the_rows_is_refused(kind):
     """Each 4-byte word that holds a length, set to other numbers of any size."""
     codec = CODECS[kind]
     data = by_rosbags(kind, rows_of(kind, 4), "skin")
-    assert len(counts_at(kind, 4)) == (8 if kind == FREQUENCIES else 10)
+    assert len(counts_at(kind, 4)) == (8 if kind == FREQUENCIES_TYPE else 10)
     for name, at in counts_at(kind, 4).items():
         for count in (0, 3, 2**15, 2**29, 2**31, 2**32 - 1):
             wrong = bytearray(data)
@@ -146,7 +146,7 @@ def test_every_count_that_contradicts_the_rows_is_refused(kind):
                     codec.decode(joined(data, bytes(wrong)))
 
 
-@pytest.mark.parametrize("kind", [FREQUENCIES, STRESS])
+@pytest.mark.parametrize("kind", [FREQUENCIES_TYPE, STRESS_TYPE])
 def test_absurd_rows_are_refused_before_anything_is_allocated(kind):
     """A short message that says it has up to 2³² rows."""
     codec = CODECS[kind]
@@ -163,7 +163,7 @@ def test_absurd_rows_are_refused_before_anything_is_allocated(kind):
         assert peak < 100_000  # a hundred times the message
 
 
-@pytest.mark.parametrize("kind", [FREQUENCIES, STRESS])
+@pytest.mark.parametrize("kind", [FREQUENCIES_TYPE, STRESS_TYPE])
 def test_a_message_cut_off_anywhere_is_refused(kind):
     codec = CODECS[kind]
     data = by_rosbags(kind, rows_of(kind, 2), "skin")
