@@ -14,6 +14,7 @@ import tty
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -125,6 +126,19 @@ def play(tmp_path: Path) -> Iterator[Play]:
         hub.close()
 
 
+def notes(source: LinkSource) -> list[str]:
+    """Problems of the first link since the last call."""
+    return source.statistics()["links"]["hub0"]["notes"]
+
+
+def wait_until(done: Callable[[], object], seconds: float) -> object:
+    """What done() returns when it is true at last, or when the time is over."""
+    until = time.monotonic() + seconds
+    while not (found := done()) and time.monotonic() < until:
+        time.sleep(0.01)
+    return found
+
+
 def first_rows(source: LinkSource, n_rows: int) -> list[FrequencyRows]:
     """Rows from a source until there are so many."""
     got: list[FrequencyRows] = []
@@ -224,26 +238,21 @@ def test_cubes_that_do_not_fit_are_counted_and_named(play: Play, tmp_path: Path)
 
 
 def test_a_slow_consumer_loses_the_oldest_rows_and_is_told(
-    play: Play, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(live, "QUEUE_S", 0.2)
-    skin = make_skin(2)
-    play(skin)
-    with open_links(skin, port_directory=tmp_path) as source:
-        got = first_rows(source, 1)
-        time.sleep(1.0)
-        monkeypatch.setattr(live, "QUEUE_S", 1e9)  # nothing is lost from here on
-        waiting = source.statistics()["rows waiting"]
-        got += first_rows(source, 200)
+    """A scan comes every 1/64 s; 0.25 s are kept, which are 17 scans."""
+    now_s = [0.0]
+    monkeypatch.setattr(live, "QUEUE_S", 0.25)
+    monkeypatch.setattr(live, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    with open_links(make_skin(2), port_directory=tmp_path) as source:
+        for number in range(100):
+            now_s[0] = number / 64
+            rows = FrequencyRows.from_values([0, 1], np.ones((2, N_PADS)), sequence=[number, number])
+            source._put(rows)
+        assert next(iter(source)).sequence.tolist() == [83, 83]
         statistics = source.statistics()
-    sequence = np.concatenate([rows.sequence[rows.cube == 0] for rows in got])
-    lost = int(np.sum(np.diff(sequence) - 1))
-    assert lost > 0
-    assert statistics["rows dropped"] == 2 * lost
-    assert statistics["rows given"] == sum(map(len, got))
-    # What waits is what came in the last 0.2 s, but for the scheduler; a second has passed.
-    assert isinstance(waiting, int)
-    assert 0 < waiting < 2 * RATE * 0.8
+    counts = [statistics[f"rows {name}"] for name in ("dropped", "given", "waiting")]
+    assert counts == [2 * 83, 2, 2 * 16]
 
 
 def test_rows_that_wait_are_counted(tmp_path: Path) -> None:
@@ -260,15 +269,10 @@ def test_a_port_that_a_simulator_will_make_is_no_news_while_it_is_missing(
 ) -> None:
     """Of a hub on a serial port it is."""
 
-    def notes(source: LinkSource) -> list[str]:
-        return source.statistics()["links"]["hub0"]["notes"]
-
     def warned(skin: Skin, **where: Path) -> list[str]:
         caplog.clear()
         with open_links(skin, rate=RATE, **where) as source:
-            until = time.monotonic() + WAIT_S
-            while not notes(source) and time.monotonic() < until:
-                time.sleep(0.01)
+            wait_until(lambda: notes(source), WAIT_S)
         return [record.message for record in caplog.records if record.levelno >= logging.WARNING]
 
     assert warned(make_skin(1), port_directory=tmp_path) == []
@@ -281,13 +285,9 @@ def test_close_ends_an_iteration_that_waits(tmp_path: Path) -> None:
     got: list[FrequencyRows] = []
     waiting = threading.Thread(target=lambda: got.extend(source))
     waiting.start()
-    time.sleep(0.1)
-    assert waiting.is_alive()
-    statistics = source.statistics()
-    links = statistics["links"]
-    assert isinstance(links, dict)
-    assert links["hub0"]["state"] == "waiting"
-    assert "plug the hub in" in links["hub0"]["notes"][0]
+    found = wait_until(lambda: notes(source), WAIT_S)
+    assert waiting.is_alive() and "plug the hub in" in found[0]
+    assert source.statistics()["links"]["hub0"]["state"] == "waiting"
     close_within(source, PROMPT_S)
     waiting.join(PROMPT_S)
     assert not waiting.is_alive()
@@ -305,10 +305,7 @@ def test_closing_stops_the_hubs_and_ends_the_thread(play: Play, tmp_path: Path) 
         for _ in source:
             close_within(source, PROMPT_S)  # from within the loop, which ends
     assert "cube reader" not in {thread.name for thread in threading.enumerate()}
-    until = time.monotonic() + PROMPT_S
-    while hub.hub.started and time.monotonic() < until:
-        time.sleep(0.01)
-    assert not hub.hub.started
+    assert wait_until(lambda: not hub.hub.started, PROMPT_S)
     links = source.statistics()["links"]
     assert isinstance(links, dict)
     assert links["hub0"]["state"] == "closed", "statistics can still be asked for"

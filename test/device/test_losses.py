@@ -5,7 +5,6 @@ and a restart."""
 
 from __future__ import annotations
 
-import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -39,16 +38,12 @@ def hello(n_cubes: int) -> Hello:
 
 
 class OneLink:
-    """The chain behind one link, given frames by hand; `report` needs a reader, so it is started
-    on a port that does not exist."""
+    """The chain behind one link, given frames by hand; its reader is not started."""
 
     def __init__(self, n_cubes: int = 1) -> None:
         self.rows: list[tuple[int, int]] = []
         cubes = [CubeAddress(f"c{index}", 0, index, None, 2) for index in range(n_cubes)]
         self.live = LiveLinks([LinkConfig("a", "/dev/none")], cubes, self._keep)
-        self.live.start()
-        while self.live._reader.links[0].state is LinkState.CLOSED:
-            time.sleep(1e-3)  # its change of state must not come between the frames
         self.lag_s = 0.0  # not that of this machine, which may be busy
         self.live._reader.take_lag_s = lambda: self.lag_s
         self.arrival_ns = EPOCH_NS
