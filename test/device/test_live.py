@@ -247,21 +247,14 @@ def test_a_slow_consumer_loses_the_oldest_rows_and_is_told(
     with open_links(make_skin(2), port_directory=tmp_path) as source:
         for number in range(100):
             now_s[0] = number / 64
-            rows = FrequencyRows.from_values([0, 1], np.ones((2, N_PADS)), sequence=[number, number])
+            rows = FrequencyRows.from_values(
+                [0, 1], np.ones((2, N_PADS)), sequence=[number, number]
+            )
             source._put(rows)
         assert next(iter(source)).sequence.tolist() == [83, 83]
         statistics = source.statistics()
     counts = [statistics[f"rows {name}"] for name in ("dropped", "given", "waiting")]
     assert counts == [2 * 83, 2, 2 * 16]
-
-
-def test_rows_that_wait_are_counted(tmp_path: Path) -> None:
-    with open_links(make_skin(1), port_directory=tmp_path) as source:
-        for n_rows in (3, 2, 4):
-            source._put(FrequencyRows.from_values(np.arange(n_rows), np.ones((n_rows, 8))))
-        next(iter(source))
-        statistics = source.statistics()
-    assert (statistics["rows given"], statistics["rows waiting"]) == (3, 6)
 
 
 def test_a_port_that_a_simulator_will_make_is_no_news_while_it_is_missing(
