@@ -21,8 +21,8 @@ from ..touch.surface import Surface
 from ..views.scene import QUANTITIES, Quantity
 
 INTERPOLATION_POINTS = 4
-"""Number of nearest points of a point cloud (pressure and shear at points of the skin's surface)
-from which the page interpolates each value."""
+"""Number of points with known pressure and shear from which the values at a point that the page
+colours are interpolated: those nearest to it."""
 
 DEVIATION = Quantity(
     label="standard deviation of pressure",

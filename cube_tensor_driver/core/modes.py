@@ -88,7 +88,7 @@ class Modes:
     Attributes:
         names: Names of the modes.
         stress: Stress S at the centre of the cube, per unit amplitude (M, 3, 3).
-        gradient: Gradient G, times d0 (half the side of the cube), per unit amplitude
+        gradient: G_ijk = d0 d(sigma_ij)/dx_k, with d0 half the side of the cube, per unit amplitude
             (M, 3, 3, 3).
     """
 

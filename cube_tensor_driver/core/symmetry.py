@@ -185,7 +185,7 @@ class Structure:
 
     @property
     def n_coefficients(self) -> int:
-        """Number of coefficients."""
+        """Number K of coefficients that determine the response matrix."""
         return len(self.names)
 
     @property

@@ -230,7 +230,8 @@ class LiveWindows:
 class RecordedWindows:
     """Reads windows (the samples of one frame each) from a folder that `LiveWindows` wrote.
 
-    A window is found by the frame number in the picture of its frame.
+    A window is found by its frame number, which the picture of the frame shows as black and white
+    squares.
 
     Args:
         folder: Folder of the recordings.

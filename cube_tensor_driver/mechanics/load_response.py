@@ -43,7 +43,9 @@ class LoadResponse:
         depth: float,
         width: float,
     ) -> None:
-        """Tabulate the response over the distance, which takes about half a second.
+        """Tabulate the components over the distance between load and cube along the surface.
+
+        This takes about half a second.
 
         Args:
             layer: Elastic layer that contains the cubes.

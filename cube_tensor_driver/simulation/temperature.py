@@ -252,7 +252,7 @@ class ThermalPads:
         return ground, air
 
     def measure(self, seconds: float) -> float:
-        """Return what the hub's thermometer measures, the temperature of the ground, in °C."""
+        """Return the temperature, in °C, that the hub measures: the one below the elastomer."""
         return round(self._find_outside_temperatures(seconds)[0], 2)
 
     def compute_effect(self, seconds: float) -> tuple[Array, Array]:

@@ -103,12 +103,14 @@ class WindowPosteriors:
     """Matrices of the windows of all cubes, for the formulas at the head of this file.
 
     The window of a cube is the cube and its nearest neighbours, W cubes in total. Windows of the
-    same kind (same relative poses and noise) share their matrices.
+    same kind (same relative poses and noise) share their matrices. A cube has C values and, in
+    shapes, P pads; in formulas, P is a matrix.
 
     Attributes:
         near: Indices (cubes, W) of the cubes of each window, sorted by their distance from its
             centre cube, which comes first.
-        inner: Number of inner cubes: the first ones of each window.
+        inner: Number of inner cubes, the first ones of each window, whose values determine the
+            scale s of the prior.
         kind: Index (cubes,) of the kind of each window.
         gain: Matrix G (kinds, points x ROWS_PER_POINT, W C) from the values of the window's cubes
             to the results at the points around its centre cube, in single precision.

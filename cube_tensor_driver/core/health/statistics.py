@@ -114,7 +114,7 @@ def make_state(rest_frequency: Array) -> HealthState:
 
 
 def clear_sums(state: HealthState) -> None:
-    """Start a new window: set all sums, counts and gaps of the state to zero, in place."""
+    """Start a new window: reset the sums, extremes, counts and gaps between rows, in place."""
     for name in ("first_squares", "second_squares", "bounded_squares", "sum"):
         state.view_pads(name)[:] = 0
     state.view_pads("lowest")[:] = np.inf

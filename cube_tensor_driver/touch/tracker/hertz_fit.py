@@ -515,7 +515,9 @@ def _linearise_alike(
     contacts: int,
     cubes: int,
 ) -> None:
-    """Linearise the response of the cubes for K fits with equal numbers of contacts and cubes.
+    """Linearise the values of the cubes in the parameters of each of K fits (`Linearisation`).
+
+    The fits have equal numbers of contacts and cubes, so that one call computes all responses.
 
     Args:
         inverse: Responses (stress in the skin under contacts of unit force).
