@@ -73,12 +73,12 @@ exponent of 0.1 to 0.4, the second differences are 0.03 to 0.7 of the mean ampli
 """
 
 BEND = 0.05
-"""Standard deviation that the second fit assumes for second differences of the creep law's
-amplitudes at successive relaxation times, divided by the mean amplitude.
+"""Standard deviation that the second fit assumes for a_k+1 - 2 q a_k + q² a_k-1, where a_k are the
+amplitudes of the creep law at successive relaxation times, divided by the mean amplitude.
 
-It is smaller than `FIRST_BEND`, because the second fit knows from the first one by which factor q
-the amplitudes a_k grow from one relaxation time to the next. Its second differences
-a_k+1 - 2 q a_k + q² a_k-1 are 0 for amplitudes with exactly this growth.
+The first fit determines the factor q by which the amplitudes grow from one relaxation time to the
+next. With exactly this growth the expression is 0, so its deviation is assumed to be smaller than
+that of the second differences of the first fit (`FIRST_BEND`), for which q = 1.
 """
 
 FAST_ERROR = 0.02

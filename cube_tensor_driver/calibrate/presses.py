@@ -79,8 +79,8 @@ All of them are tried, because people do not press at a measured distance.
 """
 
 MAX_SWAP_RATIO = 0.5
-"""Two pads are taken to be swapped only if this reduces misfit² (unexplained fraction of the
-squared stresses on the pads during presses) to at most this fraction of its value."""
+"""Two pads are taken to be swapped only if correcting the swap multiplies misfit² (unexplained
+fraction of the squared stresses on the pads during presses) by at most this number."""
 
 SIMILAR_RATIO = 1.5
 """An explanation of the presses (rotation of the cube, order of its pads) counts as equally good as

@@ -224,7 +224,7 @@ def read_warming(
 
 
 def fit_thermal(data: Warming) -> ThermalFit:
-    """Fit the lag of the elastomer and the effect of its temperature on each pad.
+    """Fit how the elastomer's temperature lags the measured one, and how it affects each pad.
 
     A quadratic effect is used only where it reduces the residual considerably.
 

@@ -89,13 +89,12 @@ def find_shipped_calibration(layout: Layout) -> Calibration | None:
     """Return the calibration that the package contains for a built-in layout.
 
     The calibration was computed with finite elements, not measured. Its list of neglected modes
-    (components of stress or gradient) is emptied. The result is None for any other layout.
+    (components of stress or gradient) is emptied: which ones may be neglected depends on the
+    application, so users state them in their own files. The result is None for any other layout.
     """
     # A layout that was read from a file may have the name of a built-in one but other pads.
     built_in = LAYOUTS.get(layout.name)
     if built_in is None or not built_in.has_same_pads(layout):
         return None
     path = find_package_data() / "config" / "calibration" / f"{layout.name}.yaml"
-    # Which modes may be neglected depends on the application, so the user states it in his own
-    # calibration file and the list in the package's file is dropped.
     return replace(read_calibration(path), neglect=())

@@ -59,11 +59,11 @@ MIN_HEIGHT = 4 * MIN_SQUARE
 (`NUMBER_GRID`), covers at most half of it."""
 
 WRITING_DELAY_MS = 2000
-"""Time, in ms, from the reading of a frame to the writing of its window. Samples that arrive later
-get into the oldest window that has not been written.
+"""Time, in ms, from the reading of a frame to the writing of its window (the samples of stress
+since the frame before). Samples that arrive later get into the oldest window not yet written.
 
-A busy computer holds up the threads that pass on samples. A live source drops samples that have
-waited longer than this (`QUEUE_S`).
+The delay leaves time for samples that a busy computer holds up. A longer one would not help,
+because a live source drops samples that have waited longer than this (`QUEUE_S`).
 """
 
 UNKNOWN_GREY = 90

@@ -150,7 +150,8 @@ class GravityMotion:
         self._transforms = Transforms(node)
 
     def compute_motion(self, first_ns: int, last_ns: int) -> Motion:
-        """Return the motion at the end of a span of time, computed from the newest transform of TF.
+        """Return the motion of the skin at the end of a span of time: the specific force of a body
+        at rest, whose direction is taken from the newest transform of TF.
 
         Arguments and errors are those of `ImuMotion.compute_motion`.
         """

@@ -34,9 +34,9 @@ from .unrolled_skin import unroll
 
 MAX_PITCH_OF_FOUR_POINTS = 3.25
 """Largest pitch (distance of neighbouring cubes), in depths of the cubes' centres, at which the
-patch of a cube has 2 x 2 points. With a larger pitch it has 3 x 3 points, one of them above the
-cube. At a pitch of 4 depths, 2 x 2 points were not enough: a ball that pressed with 0.3 N above a
-cube, between the four points, was not found."""
+traction is computed at 2 x 2 points of the surface around each cube. With a larger pitch there are
+3 x 3 points, one of them above the cube. At a pitch of 4 depths, 2 x 2 points were not enough: a
+ball that pressed with 0.3 N above a cube, between the four points, was not found."""
 
 MIN_ERROR_CHANGE = 0.1
 """Smallest change of the errors given to `SurfaceInverse.state_errors`, divided by the largest of

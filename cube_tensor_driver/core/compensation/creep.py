@@ -272,7 +272,7 @@ class Creep:
         ]
 
     def resume(self) -> None:
-        """Continue from a recorded state that was written into the arrays of `collect_parts`."""
+        """Update what depends on the arrays of `collect_parts`, into which a state was restored."""
         self._is_certain[:] = False
         self._update_certainty()
         # The state may have been recorded with other rest frequencies. A version that never occurs

@@ -142,7 +142,7 @@ class Thermal:
         self._update()
 
     def resume(self) -> None:
-        """Continue from a recorded state that was written into the arrays of `collect_parts`."""
+        """Update what depends on the arrays of `collect_parts`, into which a state was restored."""
         nothing = np.zeros(len(self.has_model))
         self._filter(nothing, self._measured, self._measured)
         self._update()

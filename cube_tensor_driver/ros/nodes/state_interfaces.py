@@ -231,7 +231,8 @@ class StateInterfaces:
             self._send(stamp_ns)
 
     def _check(self) -> None:
-        """Publish the names if they are due or have a new subscriber, and forget old wrenches."""
+        """Publish the names of the state interfaces if they are due or have a new subscriber, and
+        set wrenches to NaN that are too old."""
         now = time.monotonic()
         listeners = self._names_publisher.get_subscription_count()
         if listeners > self._listeners or now >= self._names_at:

@@ -65,9 +65,10 @@ each, and of 0.2 for planar cubes, whose pads lie in one plane and determine few
 """
 
 MAX_NEAR_MISFIT = 10.0
-"""Misfit (chi-squared per known value) up to which the first Hertz contact of a region is kept
-while other regions are near, whose contacts may cause the misfit. Larger ones were misfits of
-fingertips, or of two balls that were fitted as one contact."""
+"""Largest misfit (chi-squared per known value) with which the first Hertz contact of a region is
+kept if other regions are near. It is larger than `MAX_HERTZ_MISFIT`, because contacts of these
+regions may cause it. Larger misfits were seen when a Hertz contact was fitted to a fingertip,
+or one contact to two balls."""
 
 MAX_BAD_SCANS = 5
 """Number of successive scans (sets of values of all cubes) with too large a misfit (chi-squared per
@@ -110,10 +111,12 @@ other region, and the change of a force divided by the largest force.
 """
 
 START_ERROR = 0.15
-"""Relative standard deviation of the stress that a contact which is not fitted yet causes in the
-cubes around other contacts. Before the fit, the force of the contact is only an estimate: the
-integral of the traction that the linear inverse problem of elasticity yields from the values of all
-cubes."""
+"""Relative standard deviation, before a contact is fitted, of the stress that it causes in the
+cubes around other contacts. Their fits subtract this stress and count its error as noise.
+
+The stress is inexact, because the force is only an estimate: the integral of the traction that the
+linear inverse problem of elasticity yields from the values of all cubes.
+"""
 
 FIT_ERROR = 0.05
 """Relative standard deviation of the stress that a fitted contact causes in the cubes around other
@@ -129,9 +132,9 @@ its misfit has grown, it makes up to this number of further steps in the same sc
 """
 
 HOPELESS = 4.0
-"""Misfit (chi-squared per known value) of the first fit of a Hertz contact after half of its
-`MAX_STEPS` steps, divided by the largest misfit with which the fit is kept, above which the fit is
-given up without the other half."""
+"""The first fit of a Hertz contact is given up after half of its `MAX_STEPS` steps if its misfit
+(chi-squared per known value) is then at least this multiple of the largest one with which the fit
+is kept."""
 
 Respond = Callable[[Index], tuple[Array, Array]]
 """Function that takes the indices of n cubes and returns their response to all regions of contact:
