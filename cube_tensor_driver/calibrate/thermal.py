@@ -77,7 +77,8 @@ N_FILTERS = 4
 """Number of low-pass filters. Three leave 15 Pa of what fast warming changes, four leave 3 Pa."""
 
 LAG_RATIO = 2.5
-"""Ratio of the time constants of successive filters."""
+"""Ratio of the time constants of successive low-pass filters. The filters of the measured
+temperature stand for the conduction of heat through the elastomer."""
 
 LAG_ERROR = 0.05
 """Standard deviation of the error of the elastomer's temperature as low-pass filters compute it,

@@ -372,7 +372,7 @@ class LiveLinks:
         A scan is one sample of every cube.
 
         Args:
-            read: Read of the link that holds the samples.
+            read: The frames that hold the samples, with their link and arrival time.
             samples: The samples, in order.
         """
         if not samples:

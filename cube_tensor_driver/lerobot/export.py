@@ -34,7 +34,7 @@ class Exported(NamedTuple):
         rows: Number of exported samples of cubes.
         depth: Number of samples of each cube that a frame has room for.
         features: Names of the features (columns) that come from topics other than stress.
-        left_out: Number of samples outside of the marks, which are not exported.
+        left_out: Number of samples in no episode, which are not exported.
     """
 
     episodes: int

@@ -108,7 +108,8 @@ class BagPlan(NamedTuple):
         edges_ns: (E,) times, in ns since the Unix epoch, that divide the bag into intervals. An
             interval is a frame, or the time between two episodes. Interval i ends at edge i.
         counts: (E + 1, cubes) number of samples of each cube in each frame; 0 between episodes.
-        left_out: Number of samples that lie outside of the marks.
+        left_out: Number of samples in no episode, such as those before the first mark
+            (`MARK_TYPE`).
     """
 
     path: Path

@@ -317,19 +317,16 @@ def _compute_airy(
     ) -> tuple[Array, Complex]:
         """Return trace T and deviator D of the second derivatives of the Airy function g.
 
-        They determine the in-plane stress. T and D contain the potential chi = Z ln(R + Z) - R in
-        the terms of tangential forces and chi_Z = dchi/dZ in those of normal forces, where R is the
-        distance from the force and Z the depth below it. If each potential is replaced by its
-        derivative by Z, the results are the derivatives of T and D by Z.
-
-        In a plane Z = const, a potential h depends on the distance r from the normal through the
-        force. The arguments are h1 = (dh/dr) / r, h2 = (dh1/dr) / r and h3 = (dh2/dr) / r.
+        They determine the in-plane stress. With the distance R from a force and the depth Z below
+        it, the potential h of a tangential force is chi = Z ln(R + Z) - R, and that of a normal
+        force is dchi/dZ = ln(R + Z). T and D depend on the functions h1 = (dh/dr) / r,
+        h2 = (dh1/dr) / r and h3 = (dh2/dr) / r, where r is the distance from the normal through the
+        force, and Z is constant. With these functions of dh/dZ instead of h, the results are the
+        derivatives of T and D by Z.
 
         Args:
-            t2: h2 of the potential for tangential forces.
-            t3: h3 of the potential for tangential forces.
-            n1: h1 of the potential for normal forces.
-            n2: h2 of the potential for normal forces.
+            t2, t3: h2 and h3 for tangential forces.
+            n1, n2: h1 and h2 for normal forces.
         """
         trace = f_dot_d * (4 * t2 + r_square * t3) - fz * (2 * n1 + r_square * n2)
         deviator = 2 * force * position * t2 + position**2 * (f_dot_d * t3 - fz * n2)

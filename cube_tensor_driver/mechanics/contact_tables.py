@@ -416,18 +416,21 @@ def _to_complex(vectors: Array) -> Complex:
 
 
 def _find_triangle_neighbours(d: Array, t: Array) -> tuple[Single, Index]:
-    """Return weights and rows with which a polygon's edge is looked up in the tables.
+    """Return weights and table rows for the triangle between the origin and a polygon's edge.
+
+    The origin is the point of the surface above the cube. The triangle is the difference of two
+    right triangles. Their common leg is the perpendicular from the origin to the line of the edge;
+    the other legs run along this line to the end and to the start of the edge.
 
     Args:
-        d: Distance (...) of the line through the edge from the point of the surface above the cube,
-            divided by the depth.
-        t: Positions (..., 2) of the start and the end of the edge along this line, from the point
-            that is nearest to the cube, divided by the depth.
+        d: Length (...) of the common leg, divided by the depth.
+        t: Signed lengths (..., 2) of the legs to the start and to the end of the edge, divided by
+            the depth.
 
     Returns:
         Weights (..., 8) of bilinear interpolation, and the rows (..., 8) of the table to which they
-        belong. The first four are for the triangle up to the start of the edge, which is subtracted
-        and so has negative weights, the others for the triangle up to its end.
+        belong. The first four are for the right triangle at the start of the edge, which is
+        subtracted and so has negative weights, the others for the one at its end.
     """
     t_scale = np.hypot(1.0, d)
     eta = np.arcsinh(t / t_scale[..., None])

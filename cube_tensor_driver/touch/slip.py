@@ -103,8 +103,8 @@ of this contact so far. Friction has held the largest ratio, and the coefficient
 is rarely less than half of the static one."""
 
 MAX_RATIO_CHANGE = 0.2
-"""Largest change of the ratio of shear and normal force during slip, divided by the ratio, over the
-duration in which the motion is tested."""
+"""Largest change of the ratio of shear and normal force of a contact that slips, divided by the
+ratio. The change is taken over the same duration (`LAGS`) as the motion that shows the slip."""
 
 MIN_COSINE = 0.8
 """Smallest cosine of the angle between motion and shear force of a contact that slips.
@@ -122,10 +122,10 @@ MIN_FORCE_N = 0.05
 state is `UNKNOWN` unless slip is detected."""
 
 FOLLOWED_DEVIATION = 0.02
-"""Relative standard deviation of the ratio of shear and normal force that is computed between two
-updates of the contact tracker, from changes of the cubes' values since the last one. Its error was
-1.6 % (rms) in simulations of 24-pad cubes, for contacts that had moved by up to some millimetres
-since this update."""
+"""Relative standard deviation that is assumed for the ratio of shear and normal force between two
+updates of the contact tracker, when the ratio is computed from changes of the cubes' values since
+the last update. The relative error of the ratio was 1.6 % (rms) in simulations of 24-pad cubes, for
+contacts that had moved by up to some millimetres since this update."""
 
 MAX_SHIFT_DEPTHS = 0.2
 """Shift of a contact, divided by the depth of the cubes' centres below the surface, after which the

@@ -151,13 +151,13 @@ class Compensation:
             self.offsets.lasting[:] |= bits.astype(np.uint16)
 
     def compute_pad_errors(self, cubes: Index) -> Array:
-        """Return the errors (n, P, k) of what is subtracted from the pads, in Pa.
+        """Return the errors (n, P, k) of the compensation in the newest rows of n cubes, in Pa.
 
-        They are those of the newest rows of n cubes by k independent causes. Each column has the
-        size of one standard deviation; k is 0 while nothing is compensated.
+        Each of the k columns is the error of the stress on the pads, of one standard deviation, by
+        one of k independent causes. k is 0 while nothing is compensated.
 
         Args:
-            cubes: Numbers of the cubes.
+            cubes: Numbers (n,) of the cubes.
         """
         errors = [np.zeros((len(cubes), self._pipeline.n_pads, 0))]
         errors += [effect.compute_errors(cubes) for effect in self._lasting]

@@ -414,8 +414,9 @@ class HertzFit:
         growth = np.exp(FLATNESS_STEP * np.array([0, 0, 0, 0, 0, 1, -1]))
         sizes = np.exp(self.found.log_sizes)[:, None] * growth
 
-        # `patterns` are shares of force of the seven contacts: the whole, its derivatives by x, y
-        # and the logarithm of the radius, and the difference that defines the flatness.
+        # Each row of `patterns` contains the weights of the seven Hertz contacts in a sum: the
+        # fitted contact itself, its derivatives by x, y and the logarithm of the radius, and the
+        # difference that defines the flatness (`FLATNESS_STEP`).
         wider_share = 1 / (1 + np.exp(2 * FLATNESS_STEP))
         patterns = np.zeros((5, 7))
         patterns[[0, 4], 0] = 1

@@ -90,10 +90,10 @@ MAX_HERTZ_ASPECT = 4.0
 tried. Length and width are those that the fit on nodes (small contacts on a grid) has found."""
 
 MAX_DIRECT_PITCH = 2.5
-"""Largest pitch (distance of neighbouring cubes), in depths of the cubes' centres, at which Hertz
-contacts are fitted before the traction on nodes (small contacts on a grid). At a larger pitch, a
-fit that begins at the maximum of the pressure may end in a local optimum, on the wrong side of a
-cube."""
+"""Largest pitch (distance of neighbouring cubes), divided by the depth of the cubes' centres, at
+which the first fit of a region is that of a Hertz contact. This fit begins at the maximum of the
+pressure. At a larger pitch, it may end in a local optimum, on the wrong side of a cube, so the
+traction is fitted on nodes (small contacts on a grid) first."""
 
 HOME_PITCHES = 0.55
 """Largest distance of Hertz contacts (of their mean centre) from their home cube, the cube around
@@ -314,9 +314,10 @@ class TrackedRegion:
         return self._others_change > MAX_OTHERS_CHANGE * values.count
 
     def _follow_home(self, fit: HertzFit) -> None:
-        """Lay the skin flat around another cube if the contacts have moved there.
+        """Choose a new home cube if the contacts have moved away from it, or drop the fit.
 
-        A fit whose contacts have left the region, or pull at the surface, is dropped.
+        The home cube is the cube around which the curved skin is laid flat for the fit. The fit is
+        dropped if a contact has left the region, or if its force pulls on the skin.
         """
         inverse = self._inverse
         values = fit.values
