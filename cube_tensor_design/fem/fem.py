@@ -243,7 +243,12 @@ def solve_meshes(
         start = time.perf_counter()
         try:
             solid = make_solid(body, layout, grid)
-            pads = compute_pad_stresses(solid, layout, load(solid), report_solve)
+            pads = compute_pad_stresses(
+                solid,
+                layout,
+                load(solid),
+                report_solve,
+            )
         except MemoryError:  # Some limit that check_memory does not know was reached.
             raise ElasticError(
                 f"the memory ran out on mesh {number}, of {grid.nvertices} corners; "
@@ -325,7 +330,11 @@ def make_solid(
     plane = body.plane if layout.planar else "strain"
     cube = None
     if not np.isinf(body.cube_young):
-        cube = compute_lame_constants(body.cube_young / body.young, body.cube_poisson, plane)
+        cube = compute_lame_constants(
+            body.cube_young / body.young,
+            body.cube_poisson,
+            plane,
+        )
     elif body.ground:
         # A rigid cube moves with a body on ground, so it is a very stiff elastic one here.
         cube = compute_lame_constants(STIFF_CUBE_RATIO, 0.0, plane)

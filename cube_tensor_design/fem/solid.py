@@ -59,7 +59,10 @@ def compute_lame_constants(
     return lam, mu
 
 
-def assemble_stiffness(scalar: skfem.Basis, moduli: tuple[float, float]) -> sp.csr_matrix:
+def assemble_stiffness(
+    scalar: skfem.Basis,
+    moduli: tuple[float, float],
+) -> sp.csr_matrix:
     """Assemble the stiffness K_ij = int lambda div w_i div w_j + 2 mu eps(w_i) : eps(w_j) dV.
 
     w_i are the vector-valued nodal functions and eps their strain. The sparse matrix (dofs, dofs)

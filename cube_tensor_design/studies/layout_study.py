@@ -207,8 +207,18 @@ def _solve_box(
 
     # All parities are solved for the modes and for the passages.
     report = count_steps(progress, 2 * len(solid.parities))
-    matrix = compute_pad_stresses(solid, layout, make_mode_loads(solid, layout), report)
-    pads = compute_pad_stresses(solid, layout, make_outside_load(solid, compute_field), report)
+    matrix = compute_pad_stresses(
+        solid,
+        layout,
+        make_mode_loads(solid, layout),
+        report,
+    )
+    pads = compute_pad_stresses(
+        solid,
+        layout,
+        make_outside_load(solid, compute_field),
+        report,
+    )
     report("done")
     return matrix, pads
 

@@ -59,7 +59,12 @@ def add_arguments(parser: Parser) -> None:
         required=True,
         help="skin file to write",
     )
-    parser.add_value("--name", "NAME", "name of the skin (default: %(default)s)", default="skin")
+    parser.add_value(
+        "--name",
+        "NAME",
+        "name of the skin (default: %(default)s)",
+        default="skin",
+    )
     parser.add_value(
         "--calibration",
         "FILE",

@@ -26,10 +26,19 @@ def add_arguments(parser: Parser) -> None:
         default=DEFAULT_PITCH,
     )
     grid.add_value(
-        "--links", "N", "hubs that share the cubes (default: %(default)s)", count, default=1
+        "--links",
+        "N",
+        "hubs that share the cubes (default: %(default)s)",
+        count,
+        default=1,
     )
     grid.add_rate()
-    grid.add_value("--name", "NAME", "name of the skin (default: %(default)s)", default="skin")
+    grid.add_value(
+        "--name",
+        "NAME",
+        "name of the skin (default: %(default)s)",
+        default="skin",
+    )
     grid.add_value(
         "--port",
         "PORT",
@@ -37,7 +46,10 @@ def add_arguments(parser: Parser) -> None:
         default="/dev/ttyACM{}",
     )
     grid.add_value(
-        "--layout", "NAME", "layout of the cubes (default: %(default)s)", default="planar"
+        "--layout",
+        "NAME",
+        "layout of the cubes (default: %(default)s)",
+        default="planar",
     )
     grid.add_value(
         "--calibration",

@@ -16,11 +16,22 @@ DEFAULT_DURATION_S = 10.0
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
     parser.add_value(
-        "--config", "FILE", "skin file to simulate (default: sixteen planar cubes)", Path
+        "--config",
+        "FILE",
+        "skin file to simulate (default: sixteen planar cubes)",
+        Path,
     )
-    parser.add_value("--cubes", "N", "simulate a grid of N planar cubes instead", count)
     parser.add_value(
-        "--load", "FILE", "load script (default: a contact that wanders over the skin)", Path
+        "--cubes",
+        "N",
+        "simulate a grid of N planar cubes instead",
+        count,
+    )
+    parser.add_value(
+        "--load",
+        "FILE",
+        "load script (default: a contact that wanders over the skin)",
+        Path,
     )
     parser.add_value(
         "--mujoco",

@@ -26,8 +26,19 @@ def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
     lerobot = parser.add_subcommand("lerobot", "one LeRobot data set (v3.0) of all bags")
     _add_common(lerobot)
-    lerobot.add_value("--fps", "N", "frames per second of the data set", count, required=True)
-    lerobot.add_value("--task", "TEXT", "what was done (default: %(default)s)", default="touch")
+    lerobot.add_value(
+        "--fps",
+        "N",
+        "frames per second of the data set",
+        count,
+        required=True,
+    )
+    lerobot.add_value(
+        "--task",
+        "TEXT",
+        "what was done (default: %(default)s)",
+        default="touch",
+    )
     lerobot.add_value(
         "--marks",
         "TOPIC",
@@ -41,10 +52,16 @@ def add_arguments(parser: Parser) -> None:
         nargs="*",
     )
     lerobot.add_value(
-        "--state", "TOPIC", "topic of observation.state (default: the only topic of joint states)"
+        "--state",
+        "TOPIC",
+        "topic of observation.state (default: the only topic of joint states)",
     )
     lerobot.add_value("--action", "TOPIC", "topic of action (default: none)")
-    lerobot.add_value("--frequencies", "TOPIC", "frequencies to export, of several skins in a bag")
+    lerobot.add_value(
+        "--frequencies",
+        "TOPIC",
+        "frequencies to export, of several skins in a bag",
+    )
     for name, text in TABLES.items():
         table = parser.add_subcommand(name, text)
         _add_common(table)

@@ -37,9 +37,15 @@ def add_arguments(parser: Parser) -> None:
         nargs="?",
     )
     parser.add_value(
-        "--reference", "TOPIC", "topic of the bag to fit to: WrenchStamped (with --area) or stress"
+        "--reference",
+        "TOPIC",
+        "topic of the bag to fit to: WrenchStamped (with --area) or stress",
     )
-    parser.add_value("--cube", "NAME", "cube of the bag, if there are several in it")
+    parser.add_value(
+        "--cube",
+        "NAME",
+        "cube of the bag, if there are several in it",
+    )
     parser.add_value("--layout", "NAME", "quad, planar, cube, or a YAML file")
     parser.add_value(
         "--weight",
@@ -63,7 +69,10 @@ def add_arguments(parser: Parser) -> None:
         nargs="+",
     )
     parser.add_value(
-        "--symmetry", "G", "full, slab, mirrors or none (default: %(default)s)", default="full"
+        "--symmetry",
+        "G",
+        "full, slab, mirrors or none (default: %(default)s)",
+        default="full",
     )
     parser.add_output(
         "-o",
@@ -77,8 +86,18 @@ def add_arguments(parser: Parser) -> None:
         "FILE",
         "calibration that gives beta, modulus and half side (default: the shipped one)",
     )
-    parser.add_value("--area", "M2", "area that fx fy fz act on, square metres", positive)
-    parser.add_value("--uid", "UID", "uid of the only cube that the calibration is for", uid)
+    parser.add_value(
+        "--area",
+        "M2",
+        "area that fx fy fz act on, square metres",
+        positive,
+    )
+    parser.add_value(
+        "--uid",
+        "UID",
+        "uid of the only cube that the calibration is for",
+        uid,
+    )
     parser.add_output(
         "--figure",
         kind="picture",
@@ -144,7 +163,11 @@ def run_table(options: argparse.Namespace) -> None:
     # response of the pads. Their average has given the rest frequencies.
     loaded = loads.state.any(axis=1)
     temperature = None if loads.temperature is None else loads.temperature[loaded]
-    measured = compute_measured_stress(base, loads.frequency[loaded], temperature)
+    measured = compute_measured_stress(
+        base,
+        loads.frequency[loaded],
+        temperature,
+    )
     structure = find_structure(layout, options.symmetry)
     result = fit(
         structure,

@@ -20,7 +20,10 @@ def add_arguments(parser: Parser) -> None:
         nargs="+",
     )
     parser.add_value(
-        "--ports", "DIR", "folder of the simulated ports (default: that of the newest demo)", Path
+        "--ports",
+        "DIR",
+        "folder of the simulated ports (default: that of the newest demo)",
+        Path,
     )
 
 

@@ -17,12 +17,20 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_value("name", "NAME", "quad, planar, cube, or a YAML file with a layout")
     parser.add_value(
-        "--symmetry", "G", "full, slab, mirrors or none (default: that of the calibration)"
+        "name",
+        "NAME",
+        "quad, planar, cube, or a YAML file with a layout",
     )
     parser.add_value(
-        "--calibration", "FILE", "calibration file or name (default: the computed one)"
+        "--symmetry",
+        "G",
+        "full, slab, mirrors or none (default: that of the calibration)",
+    )
+    parser.add_value(
+        "--calibration",
+        "FILE",
+        "calibration file or name (default: the computed one)",
     )
     parser.add_json()
     parser.add_output(

@@ -12,8 +12,18 @@ from .parser import Parser
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
     parser.add_value("node", "NODE", "as in reconstruction", nargs="?")
-    parser.add_value("name", "NAME", "the parameter (default: all)", nargs="?")
-    parser.add_value("value", "VALUE", "set it to this, as in YAML", nargs="?")
+    parser.add_value(
+        "name",
+        "NAME",
+        "the parameter (default: all)",
+        nargs="?",
+    )
+    parser.add_value(
+        "value",
+        "VALUE",
+        "set it to this, as in YAML",
+        nargs="?",
+    )
 
 
 def run(options: argparse.Namespace) -> int:

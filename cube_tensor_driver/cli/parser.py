@@ -118,11 +118,22 @@ class Parser(argparse.ArgumentParser):
 
     def add_bags(self) -> None:
         """Add the argument BAG ..., several bags to read."""
-        self.add_value("bags", "BAG", "folders or files of bags", Path, nargs="+")
+        self.add_value(
+            "bags",
+            "BAG",
+            "folders or files of bags",
+            Path,
+            nargs="+",
+        )
 
     def add_jobs(self) -> None:
         """Add the option --jobs N, the number of processes that work at the same time."""
-        self.add_value("--jobs", "N", "number of processes (default: one per core)", count)
+        self.add_value(
+            "--jobs",
+            "N",
+            "number of processes (default: one per core)",
+            count,
+        )
 
     def add_rate(self) -> None:
         """Add the option --rate HZ, the sample rate in a skin file."""
@@ -353,7 +364,11 @@ sample_rate = _make_number_type(
     # Hubs and skin files have the same limits.
     lambda rate: 0.1 <= rate <= 10_000,
 )
-count = _make_number_type(int, "a whole number of at least 1", lambda n: n >= 1)
+count = _make_number_type(
+    int,
+    "a whole number of at least 1",
+    lambda n: n >= 1,
+)
 whole_number = _make_number_type(
     int,
     "a whole number of at least 0",

@@ -15,10 +15,18 @@ def add_arguments(parser: Parser) -> None:
     parser.add_bag()
     parser.add_value("--cube", "NAME", "which cube (default: the first)")
     parser.add_value(
-        "--from", "S", "begin S seconds after the start of the bag", number, default=0.0
+        "--from",
+        "S",
+        "begin S seconds after the start of the bag",
+        number,
+        default=0.0,
     )
     parser.add_value(
-        "--to", "S", "end S seconds after the start of the bag", number, default=math.inf
+        "--to",
+        "S",
+        "end S seconds after the start of the bag",
+        number,
+        default=math.inf,
     )
     parser.add_output(
         "-o",

@@ -34,7 +34,10 @@ def add_arguments(parser: Parser) -> None:
         default=RECORDED,
     )
     parser.add_value(
-        "--duration", "S", "end S seconds after the first message (default: Ctrl-C)", positive
+        "--duration",
+        "S",
+        "end S seconds after the first message (default: Ctrl-C)",
+        positive,
     )
     parser.add_argument(
         "--storage",
@@ -42,8 +45,18 @@ def add_arguments(parser: Parser) -> None:
         default="mcap",
         help="format of the files (default: %(default)s)",
     )
-    parser.add_value("--split-size", "MB", "begin a new file after MB megabytes", positive)
-    parser.add_value("--split-time", "S", "begin a new file after S seconds", positive)
+    parser.add_value(
+        "--split-size",
+        "MB",
+        "begin a new file after MB megabytes",
+        positive,
+    )
+    parser.add_value(
+        "--split-time",
+        "S",
+        "begin a new file after S seconds",
+        positive,
+    )
 
 
 def run(options: argparse.Namespace) -> int:

@@ -33,7 +33,11 @@ def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
     parser.add_bag()
     parser.add_value(
-        "--rate", "R", "times the recorded speed (default: %(default)g)", positive, default=1.0
+        "--rate",
+        "R",
+        "times the recorded speed (default: %(default)g)",
+        positive,
+        default=1.0,
     )
     parser.add_switch("--loop", "begin again at the end")
     parser.add_value(

@@ -56,7 +56,11 @@ def add_overrides(parser: Parser) -> None:
     Args:
         parser: The parser of a command that reprocesses bags.
     """
-    parser.add_value("--calibration", "FILE", "calibration of all cubes (default: as recorded)")
+    parser.add_value(
+        "--calibration",
+        "FILE",
+        "calibration of all cubes (default: as recorded)",
+    )
     parser.add_value(
         "--skin",
         "FILE",

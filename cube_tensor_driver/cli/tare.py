@@ -12,7 +12,12 @@ from .parser import Parser
 
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
-    parser.add_value("cubes", "CUBE", "names of cubes to tare (default: all)", nargs="*")
+    parser.add_value(
+        "cubes",
+        "CUBE",
+        "names of cubes to tare (default: all)",
+        nargs="*",
+    )
     parser.add_switch(
         "--clear",
         "go back to the rest frequencies of the calibration, for all cubes",

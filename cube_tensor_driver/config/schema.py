@@ -54,7 +54,10 @@ _NUMBER_WORDS = {1: "one", 2: "two"}
 """Words for small numbers in error messages."""
 
 
-def make_mapping_schema(required: Iterable[str], properties: Mapping[str, object]) -> JsonSchema:
+def make_mapping_schema(
+    required: Iterable[str],
+    properties: Mapping[str, object],
+) -> JsonSchema:
     """Return the JSON schema of a mapping.
 
     Args:
@@ -100,7 +103,11 @@ def make_number_schema(description: str, **limits: float) -> JsonSchema:
     }
 
 
-def make_integer_schema(minimum: int, maximum: int, description: str) -> JsonSchema:
+def make_integer_schema(
+    minimum: int,
+    maximum: int,
+    description: str,
+) -> JsonSchema:
     """Return the JSON schema of an integer from `minimum` to `maximum`, both included.
 
     Args:

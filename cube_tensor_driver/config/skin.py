@@ -110,7 +110,9 @@ _SCHEMA = Schema(
             "name": NAME,
             "parent_frame": _FRAME,
             "rate": make_number_schema(
-                "samples per second, 0.1 to 10000", minimum=0.1, maximum=10_000
+                "samples per second, 0.1 to 10000",
+                minimum=0.1,
+                maximum=10_000,
             ),
             "elastomer": _ELASTOMER,
             "links": make_list_schema(_LINK, "links"),

@@ -140,7 +140,11 @@ class Modes:
             row /= row.sum()
         return rows @ self.fields
 
-    def compute_amplitudes(self, stress: Array, gradient: Array | None = None) -> Array:
+    def compute_amplitudes(
+        self,
+        stress: Array,
+        gradient: Array | None = None,
+    ) -> Array:
         """Compute the amplitudes of the modes in given stress fields.
 
         A part of a field that no mode expresses is ignored: one that violates equilibrium or, for

@@ -114,7 +114,10 @@ def make_generic_response(structure: Structure) -> Array:
     return compute_response(structure, coefficients)
 
 
-def compute_response(structure: Structure, coefficients: Mapping[str, float]) -> Array:
+def compute_response(
+    structure: Structure,
+    coefficients: Mapping[str, float],
+) -> Array:
     """Compute the response matrix A = sum_k c_k B_k.
 
     Args:

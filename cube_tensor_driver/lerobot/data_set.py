@@ -123,7 +123,10 @@ class DataSet:
                 table = pyarrow.table({key: _as_column(one) for key, one in columns.items()})
                 # Dictionary encoding saves space only if values repeat. Measured ones rarely do.
                 writer = writer or pyarrow.parquet.ParquetWriter(
-                    path, table.schema, compression="zstd", use_dictionary=False
+                    path,
+                    table.schema,
+                    compression="zstd",
+                    use_dictionary=False,
                 )
                 writer.write_table(table)
                 self._frames += len(table)
@@ -145,7 +148,12 @@ class DataSet:
             dtype, shape, names = "image", pixels.shape, IMAGE_AXES
             # LeRobot normalises images of the shape (bands, height, width), to which statistics of
             # the shape (bands, 1, 1) are broadcast.
-            rows = pixels[::PIXEL_STRIDE, ::PIXEL_STRIDE].reshape(-1, shape[2], 1, 1)
+            rows = pixels[::PIXEL_STRIDE, ::PIXEL_STRIDE].reshape(
+                -1,
+                shape[2],
+                1,
+                1,
+            )
         else:
             dtype, shape = values.dtype.name, values.shape[1:] or (1,)
             names = AXES[: len(shape)] if len(shape) > 1 else self._names.get(key)
@@ -159,7 +167,11 @@ class DataSet:
             self._parts[key].append(describe(rows, is_chosen))
 
     def _end_episode(
-        self, plan: BagPlan, episode: Episode, first_frame: int, first_part: int
+        self,
+        plan: BagPlan,
+        episode: Episode,
+        first_frame: int,
+        first_part: int,
     ) -> None:
         """Add an episode, whose frames have all been written, to the table of episodes."""
         frames = self._frames - first_frame
@@ -182,7 +194,11 @@ class DataSet:
             described |= {f"stats/{key}/{name}": value for name, value in statistics.items()}
         self._episodes.append(described)
 
-    def write_meta(self, skin: Skin, calibrations: list[dict[str, object]]) -> None:
+    def write_meta(
+        self,
+        skin: Skin,
+        calibrations: list[dict[str, object]],
+    ) -> None:
         """Write episodes, tasks, features and statistics into the folder meta/ of the data set.
 
         It is called once, after the last bag.

@@ -92,8 +92,19 @@ def export_lerobot(
         for plan in plans:
             with open_bag(plan.path, choices.frequencies) as source:
                 rows = _read_stress(plan, source, choices, calibrations)
-                windows = stream_windows(rows, plan.blocks, plan.counts, depth)
-                columns = _add_topics(plan, windows, source.bag, topics, report)
+                windows = stream_windows(
+                    rows,
+                    plan.blocks,
+                    plan.counts,
+                    depth,
+                )
+                columns = _add_topics(
+                    plan,
+                    windows,
+                    source.bag,
+                    topics,
+                    report,
+                )
                 data_set.write_bag(plan, columns)
         data_set.write_meta(skin, calibrations)
     return Exported(

@@ -69,7 +69,11 @@ because a live source drops samples that have waited longer than this (`QUEUE_S`
 UNKNOWN_GREY = 90
 """Brightness (0 to 255) of the cubes whose stress along z is unknown."""
 
-NO_ROWS = StressRows.from_values(np.empty(0, np.uint16), np.empty((0, 6)), np.empty((0, 9)))
+NO_ROWS = StressRows.from_values(
+    np.empty(0, np.uint16),
+    np.empty((0, 6)),
+    np.empty((0, 9)),
+)
 """A table without rows, with which the list of the parts of a window begins."""
 
 
@@ -204,7 +208,11 @@ class LiveWindows:
             # A window has at least one place for samples, even if it has no sample.
             depth = int(np.bincount(rows.cube, minlength=1).max(initial=1))
             first_frame = np.zeros(len(rows), np.intp)
-            columns = arrange_windows(first_frame, rows, (1, depth, len(self._level)))
+            columns = arrange_windows(
+                first_frame,
+                rows,
+                (1, depth, len(self._level)),
+            )
             columns[NUMBER_COLUMN] = np.array([number])
             batch = pyarrow.record_batch({name: as_column(one) for name, one in columns.items()})
             if self._writer is None:

@@ -156,7 +156,13 @@ def plan_bag(path: Path, choices: Choices) -> BagPlan:
         edges_ns = np.empty(0, np.int64)
         between = [0]
         limits_ns = [*marks_ns, MAX_TIME_NS]
-        parts = zip(tasks, first_ns.tolist(), last_ns.tolist(), limits_ns, strict=True)
+        parts = zip(
+            tasks,
+            first_ns.tolist(),
+            last_ns.tolist(),
+            limits_ns,
+            strict=True,
+        )
         for task, begin_ns, end_ns, limit_ns in parts:
             if not task or begin_ns > end_ns:
                 continue

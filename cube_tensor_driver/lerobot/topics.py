@@ -8,11 +8,11 @@ Each frame gets the newest message that is stamped before the end of the frame.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, is_dataclass
 from operator import attrgetter, itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, SupportsFloat, cast
 
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -79,7 +79,11 @@ class Topic:
                 _, self.shape = encode(message, f"{bag.path}: {self.name}")
                 return
 
-    def sample(self, bag: Bag, blocks: Iterable[Times]) -> Iterator[Single | list[bytes]]:
+    def sample(
+        self,
+        bag: Bag,
+        blocks: Iterable[Times],
+    ) -> Iterator[Single | list[bytes]]:
         """Yield the newest values before the ends of some frames, one block of frames at a time.
 
         Before the first message, numbers are NaN and images are black. So they are in bags that do
@@ -122,7 +126,11 @@ class Topic:
                 files.append(file)
             yield files
 
-    def _sample_numbers(self, bag: Bag, blocks: Iterable[Times]) -> Iterator[Single]:
+    def _sample_numbers(
+        self,
+        bag: Bag,
+        blocks: Iterable[Times],
+    ) -> Iterator[Single]:
         """Yield the newest numbers before the ends of some frames; see `sample`."""
         messages = sorted(self._read_numbers(bag), key=itemgetter(0))
         stamps_ns = [stamp for stamp, _ in messages]
@@ -144,7 +152,7 @@ class Topic:
             if self.msgtype == JOINT_STATE_TYPE:
                 numbers = _find_joint_numbers(message, f"{bag.path}: {self.name}")
             else:
-                numbers = _find_numbers(vars(message), "")
+                numbers = _find_numbers(vars(message).items(), "")
             yield read_stamp_ns(message), numbers
 
 
@@ -217,24 +225,28 @@ def _is_usable(msgtype: str) -> bool:
     return not any(sign in definition for sign in LIST_SIGNS)
 
 
-def _find_numbers(parts: Mapping[Any, Any], prefix: str) -> dict[str, float]:
+def _find_numbers(
+    parts: Iterable[tuple[object, object]],
+    prefix: str,
+) -> dict[str, float]:
     """Return the numbers in a message by their paths, such as ``wrench.force.x``.
 
     Args:
-        parts: Fields of a message by name, or entries of a list by index.
+        parts: Names and values of the fields of a message, or indices and values of a list.
         prefix: Path from the outermost message to these parts, ending in "."; "" for its fields.
     """
     numbers: dict[str, float] = {}
-    for name, part in parts.items():
+    for name, part in parts:
         if name == "header" or isinstance(part, str):
             continue
         path = f"{prefix}{name}"
         if is_dataclass(part):
-            numbers |= _find_numbers(vars(part), f"{path}.")
-        elif np.ndim(part):
-            numbers |= _find_numbers(dict(enumerate(part)), f"{path}.")
+            numbers |= _find_numbers(vars(part).items(), f"{path}.")
+        elif isinstance(part, Iterable):
+            numbers |= _find_numbers(enumerate(part), f"{path}.")
         else:
-            numbers[path] = float(part)
+            # All other fields are numbers or truth values.
+            numbers[path] = float(cast("SupportsFloat", part))
     return numbers
 
 

@@ -95,7 +95,11 @@ def arrange_windows(
     windows: dict[str, AnyArray] = {}
     for key, values in columns.items():
         empty = np.nan if values.dtype == np.float32 else 0
-        windows[key] = np.full((*shape, *values.shape[1:]), empty, values.dtype)
+        windows[key] = np.full(
+            (*shape, *values.shape[1:]),
+            empty,
+            values.dtype,
+        )
         windows[key][place] = values[order]
     windows[f"{TACTILE}.count"] = counts.reshape(n_frames, n_cubes)
     return windows

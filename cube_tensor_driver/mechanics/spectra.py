@@ -74,7 +74,11 @@ class Spectra:
     minus: Array
     normal: Array
 
-    def compute_radial_response(self, bessel: BesselTable, load_spectra: Array) -> Array:
+    def compute_radial_response(
+        self,
+        bessel: BesselTable,
+        load_spectra: Array,
+    ) -> Array:
         """Compute the response at given distances from forces distributed over the surface.
 
         Args:

@@ -128,7 +128,12 @@ class TractionPrior:
             SHEAR_RATIO,
         )
         at_zero = tabulate_bessel(spectra.k, np.zeros(1))
-        own, _ = points.compute_covariance(points, at_zero, prior, SHEAR_RATIO)
+        own, _ = points.compute_covariance(
+            points,
+            at_zero,
+            prior,
+            SHEAR_RATIO,
+        )
         return {
             "cross": cross,
             "real": real,

@@ -354,7 +354,11 @@ def compute_skin_components(
     """
     components = np.empty((len(skin.cubes), len(COMPONENTS)))
     for calibration, rows in group_by_calibration(skin.calibrations):
-        state = compute_true_amplitudes(calibration, stress[rows], gradient[rows])
+        state = compute_true_amplitudes(
+            calibration,
+            stress[rows],
+            gradient[rows],
+        )
         in_pascal = state @ calibration.modes.components.T
         components[rows] = in_pascal * calibration.component_scale
     return components

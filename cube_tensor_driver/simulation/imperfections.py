@@ -97,7 +97,9 @@ _SCHEMA = Schema(
         (),
         {
             "gain_spread": make_number_schema(
-                "a number from 0 to below 1", minimum=0, exclusiveMaximum=1
+                "a number from 0 to below 1",
+                minimum=0,
+                exclusiveMaximum=1,
             ),
             "dead": make_number_schema("a fraction of the pads from 0 to 1", minimum=0, maximum=1),
             "creep": _make_table_schema(
@@ -106,7 +108,9 @@ _SCHEMA = Schema(
                 make_number_schema("a time above 0 s", exclusiveMinimum=0),
             ),
             "creep_growth": make_number_schema(
-                "a growth from 0 to below 1", minimum=0, exclusiveMaximum=1
+                "a growth from 0 to below 1",
+                minimum=0,
+                exclusiveMaximum=1,
             ),
             "creep_exponent": make_number_schema(
                 "an exponent between 0 and 1",
@@ -114,7 +118,9 @@ _SCHEMA = Schema(
                 exclusiveMaximum=1,
             ),
             "creep_spread": make_number_schema(
-                "a number from 0 to below 1", minimum=0, exclusiveMaximum=1
+                "a number from 0 to below 1",
+                minimum=0,
+                exclusiveMaximum=1,
             ),
             "temperature": _KNOTS,
             "air": _KNOTS,

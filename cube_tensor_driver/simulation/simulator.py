@@ -160,7 +160,11 @@ class Simulator:
         for number in range(instants):
             stress, gradient = load.compute_stress_field(number * load.period / instants)
             for link in self._links:
-                frequency = link.carried.compute_frequency(stress, gradient, 0.0)
+                frequency = link.carried.compute_frequency(
+                    stress,
+                    gradient,
+                    0.0,
+                )
                 link.prepared.append(frequency)
         for link in self._links:
             link.line.send(link.hub.make_hello(), 0)

@@ -17,7 +17,11 @@ def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
     parser.add_value("port", "PORT", "device path, or socket://host:port")
     parser.add_value(
-        "--baud", "N", "rate of a serial port (default: %(default)s)", count, default=921_600
+        "--baud",
+        "N",
+        "rate of a serial port (default: %(default)s)",
+        count,
+        default=921_600,
     )
     parser.add_json()
     parser.epilog = (

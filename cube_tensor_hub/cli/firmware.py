@@ -39,7 +39,12 @@ def add_arguments(parser: Parser) -> None:
         "(default: skin_firmware.yaml of the package)",
         Path,
     )
-    run.add_value("--load", "FILE", "load script (default: an indenter that wanders)", Path)
+    run.add_value(
+        "--load",
+        "FILE",
+        "load script (default: an indenter that wanders)",
+        Path,
+    )
     parser.add_subcommand("test", "run the tests of the firmware")
 
 

@@ -100,7 +100,13 @@ def check_sequence_numbers(transcript: Transcript) -> RuleResult:
             return report_failed(f"number {sample.sequence} came after {last.sequence}, {where}")
     first, last = samples[0][1], samples[-1][1]
     # A hub that has just been switched on says so: it has taken no sample yet.
-    stats = transcript.select_frames(Stats, "opened", "hello", "stop", "quiet")
+    stats = transcript.select_frames(
+        Stats,
+        "opened",
+        "hello",
+        "stop",
+        "quiet",
+    )
     if stats and stats[-1].taken == 0 and first.sequence != 0:
         return report_failed(f"the first sample since power-up has number {first.sequence}")
     return report_passed(
@@ -378,7 +384,8 @@ def check_full_buffer(transcript: Transcript) -> RuleResult:
     if step.damaged:
         return report_failed(f"{step.damaged} damaged frames after {UNREAD_S:g} s without reading")
     if transcript.select_frames(Sample, "fast") and not transcript.select_frames(
-        Sample, "period again"
+        Sample,
+        "period again",
     ):
         return report_failed(f"no sample came any more after {UNREAD_S:g} s without reading")
     # The reference is the last STATS of the steps before "unread", in which everything was read.

@@ -77,7 +77,12 @@ def check_frequencies(run: Run) -> FrequencyFindings:
         "repeated": len(known) - len(arrived),
     }
     sampled_ns = samples.time_ns[np.maximum(sample, 0)]
-    examples = run.describe_examples("wrong: cube", rows.cube, sampled_ns, is_wrong)
+    examples = run.describe_examples(
+        "wrong: cube",
+        rows.cube,
+        sampled_ns,
+        is_wrong,
+    )
     examples += run.describe_examples("lost: link", samples.link, samples.time_ns, is_lost)
     return FrequencyFindings(figures, examples, is_checked, missing)
 

@@ -90,7 +90,11 @@ def add_arguments(parser: Parser) -> None:
     for chain in (skin, touch, contacts):
         _add_chain(chain)
     contacts.add_value(
-        "--loads", "N", "number of loads of each shape (default: %(default)s)", count, default=10
+        "--loads",
+        "N",
+        "number of loads of each shape (default: %(default)s)",
+        count,
+        default=10,
     )
     contacts.add_output(
         "--figure",
@@ -121,11 +125,19 @@ def _add(
     benchmark = parser.add_subcommand(name, text)
     if cubes is not None:
         benchmark.add_value(
-            "--cubes", "N", "number of cubes (default: %(default)s)", count, default=cubes
+            "--cubes",
+            "N",
+            "number of cubes (default: %(default)s)",
+            count,
+            default=cubes,
         )
     if timed:
         benchmark.add_value(
-            "--rate", "HZ", "scans per second (default: %(default)g)", sample_rate, default=rate
+            "--rate",
+            "HZ",
+            "scans per second (default: %(default)g)",
+            sample_rate,
+            default=rate,
         )
         benchmark.add_value(
             "--duration",

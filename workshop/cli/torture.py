@@ -19,7 +19,11 @@ def add_arguments(parser: Parser) -> None:
         default=60.0,
     )
     parser.add_value(
-        "--seed", "N", "seed of the random mix (default: %(default)s)", whole_number, default=0
+        "--seed",
+        "N",
+        "seed of the random mix (default: %(default)s)",
+        whole_number,
+        default=0,
     )
     parser.add_value(
         "--mutate",

@@ -155,7 +155,12 @@ class ContactWriter:
             newest = touches[-1] if touches else NO_TOUCHES
             self._write_contacts(stamp_ns, recorded_ns[number], newest)
 
-    def _write_contacts(self, stamp_ns: int, recorded_ns: int, touches: Touches) -> None:
+    def _write_contacts(
+        self,
+        stamp_ns: int,
+        recorded_ns: int,
+        touches: Touches,
+    ) -> None:
         """Write the contacts and traction of the newest stress of each cube, if they are due.
 
         Between two due times, only the contacts are written, and only when one begins to slip.

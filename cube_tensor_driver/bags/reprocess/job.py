@@ -289,7 +289,11 @@ def _write_skin(
     """
     bag, skin = source.bag, source.topic.removesuffix("frequencies")
     settings = choose_settings(source, job.overrides)
-    writer.add_topic(f"{skin}info", INFO_TYPE, [describe_quality(latched=True)])
+    writer.add_topic(
+        f"{skin}info",
+        INFO_TYPE,
+        [describe_quality(latched=True)],
+    )
     writer.add_topic(f"{skin}stress", STRESS_TYPE, [describe_quality()])
     infos = list(_replace_settings(source.recording.infos, settings))
     for info in infos:

@@ -175,7 +175,9 @@ class Thermal:
             self.offset += coefficient
             self.offset *= self._level
         for coefficient, behind_filter in zip(
-            self._relative_lagging, self._filters.lag, strict=False
+            self._relative_lagging,
+            self._filters.lag,
+            strict=False,
         ):
             self.offset += coefficient * behind_filter
         by_lag = self._ramp_size * np.abs(self._behind[:, 0])

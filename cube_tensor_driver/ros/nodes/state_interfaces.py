@@ -103,7 +103,11 @@ class SkinWrenches:
         """
         rows = rows.select(rows.cube < len(self._wrench))
         sides = self._side[rows.cube, None]
-        force, torque = compute_contact_wrench(rows.stress, rows.gradient, sides)
+        force, torque = compute_contact_wrench(
+            rows.stress,
+            rows.gradient,
+            sides,
+        )
         wrench = np.hstack([force, torque])
         # `compute_contact_wrench` counts unknown components as 0, which would look like no load.
         is_invalid = rows.status & INVALID != 0
