@@ -41,7 +41,7 @@ from ..core.calibration import Calibration
 from ..core.compensation.models import ThermalModel
 from ..core.compensation.thermal import START_KELVIN
 from ..core.errors import BagError, FitError
-from ..core.oscillator import compute_pad_frequency
+from ..core.oscillator import compute_pad_frequency, compute_pad_stress
 from ..messages.codec import SECOND
 from .block_means import BlockMeans, find_lags
 
@@ -163,16 +163,22 @@ class ThermalFit:
             base: Calibration with which the stresses were computed.
             source: Text that states the origin of the values.
         """
-        rest = compute_pad_frequency(
-            self.offset,
+        # With the new rest frequencies, the pad law gives other changes of stress than with those
+        # of `base`, to which the model was fitted.
+        changes = np.array([[0.0], [1.0]])
+        rest, changed = compute_pad_frequency(
+            self.offset + changes,
             base.rest_frequency,
             base.beta,
             base.modulus,
         )
+        scale = compute_pad_stress(changed, rest, base.beta, base.modulus)[:, None]
+        of_pads = "coefficient", "deviation", "ramp", "lagging"
+        scaled = {name: scale * getattr(self.model, name) for name in of_pads}
         return replace(
             base,
             rest_frequency=rest,
-            thermal=self.model,
+            thermal=replace(self.model, **scaled),
             source=source,
         )
 
