@@ -17,7 +17,7 @@ from cube_tensor_driver.core.compensation.models import ThermalModel
 from cube_tensor_driver.core.compensation.thermal import LOST_KELVIN, START_KELVIN
 from cube_tensor_driver.core.errors import CalibrationError, LayoutError
 from cube_tensor_driver.core.layout import LAYOUTS
-from cube_tensor_driver.core.oscillator import compute_pad_frequency
+from cube_tensor_driver.core.oscillator import TemperatureModel, compute_pad_frequency
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows, concatenate
 from cube_tensor_driver.core.status import COMPENSATION, THERMAL
@@ -144,6 +144,36 @@ def test_the_deviation_grows_while_the_elastomer_lags_and_a_bit_says_so():
     # Nothing but a common drift of all pads, 1 Pa per pad, reads as pressure from all sides.
     uniform = matrix @ np.ones(8)
     assert uniform[0] == pytest.approx(uniform[2], rel=0.05) and abs(uniform[4]) < 1e-9
+
+
+@pytest.mark.parametrize("is_known", [False, True])
+def test_the_drift_of_oscillators_multiplies_a_load_unless_it_is_known(is_known):
+    """100 ppm/K for 15 K, which the model of temperature knows without load."""
+    assert PLANAR is not None
+    unloaded = PLANAR.modulus * (1 + PLANAR.beta) * 1e-4
+    model = ThermalModel(np.array(25.0), np.array([0.0]), unloaded[:, None] * (not is_known))
+    stated = TemperatureModel(np.array(25.0), np.full((8, 1), 1e-4)) if is_known else None
+    one = replace(PLANAR, thermal=model, temperature=stated)
+    reconstruct = Reconstructor([one, one], np.float64)
+    load = np.array([-800.0, 0.0, -1e3, 0.0, 50.0, 0.0])
+    pads = one.modes.compute_amplitudes(np.stack([load, 0 * load])) @ one.response.T
+    for second in range(61):
+        rest = PLANAR.rest_frequency * (1 + 1e-4 * second / 4)
+        row = FrequencyRows.from_values(
+            [0, 1],
+            compute_pad_frequency(pads, rest, PLANAR.beta, PLANAR.modulus),
+            stamp_ns=10**18 + second * 10**9,
+            temperature=25.0 + second / 4,
+        )
+        found = reconstruct.process(row)
+    growth = reconstruct.compute_covariance(0) - reconstruct.pipeline.compute_covariance(0)
+    error = (found.stress[0] - found.stress[1] - load)[[0, 2]]
+    if is_known:
+        assert np.abs(error).max() < 1e-3 and growth[2, 2] == 0
+    else:
+        assert np.abs(error).min() > 1.5
+        deviation = np.sqrt(np.diag(growth))[[0, 2]]
+        np.testing.assert_allclose(deviation, np.abs(error), rtol=5e-3)
 
 
 def test_an_unknown_temperature_is_a_stated_deviation():

@@ -71,7 +71,7 @@ class Compensation:
             subtracted=np.zeros(shape, real),
             newest_force=np.full((n_cubes, 3), np.nan, real),
         )
-        self._thermal = Thermal(pipeline)
+        self._thermal = Thermal(pipeline, self.offsets)
         self.creep = Creep(pipeline, self.offsets)
         # Effects that depend on earlier rows. Weight depends on the row itself only.
         with_history = self._thermal, self.creep

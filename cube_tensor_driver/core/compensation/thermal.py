@@ -19,7 +19,8 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import Array, Index, Real, index_cubes
-from ..kernel.contract import Columns
+from ..calibration import tabulate_pads
+from ..kernel.contract import Columns, Offsets
 from ..pipeline import Pipeline
 from ..status import THERMAL
 from .low_pass import MAX_STEP_NS, LowPass
@@ -42,6 +43,10 @@ MAX_DEVIATION = 30.0
 cube's rows get the status bit COMPENSATION (the compensation is uncertain). It is a tenth of the
 pressure that counts as a contact (300 Pa)."""
 
+DRIFT = 1e-4
+"""Standard deviation of the drift of oscillators (relative change of their frequency per K) that a
+calibration does not state. It is the usual temperature coefficient of R and C, 100 ppm/K."""
+
 MIN_LAG_S = 1e-3
 """Smallest time constant of a low-pass filter, in s. It replaces a shorter one in a calibration,
 such as 0 (no lag), because the filter divides by the time constant."""
@@ -59,13 +64,15 @@ class Thermal:
     key = "thermal"
     bit = THERMAL
 
-    def __init__(self, pipeline: Pipeline) -> None:
+    def __init__(self, pipeline: Pipeline, newest: Offsets) -> None:
         """Start without any row.
 
         Args:
             pipeline: Pipeline with the calibrations, which contain the models of temperature, and
                 the stiffness of the pads, by which the thermal stress is divided (see `offset`).
+            newest: Values that the kernel shares, with the newest row of each cube.
         """
+        self._newest = newest
         models = [calibration.thermal for calibration in pipeline.calibrations]
         self.has_model = np.array([model is not None for model in models])
         n_cubes, n_pads = pipeline.stiffness.shape
@@ -98,6 +105,12 @@ class Thermal:
             np.inf,
         )
         self._relative = np.moveaxis(self._coefficient, 2, 0)[::-1] / stiffness
+        # The drift d of a frequency changes the stress v on a pad by d E (1 + beta), which the
+        # model contains, and by d (1 + 2 beta) v (pad law, for small v), which it does not contain
+        # for a load v. The latter (C, P) is that of a typical drift, in Pa per K and per reading.
+        beta = tabulate_pads(pipeline.calibrations, "beta", n_pads, fill=0)
+        is_unknown = np.array([one.temperature is None for one in pipeline.calibrations])
+        self._drift = DRIFT * is_unknown[:, None] * (1 + 2 * beta) * pipeline.stiffness
         lagging = tabulate(models, "lagging", (n_pads, 0))
         self._relative_lagging = np.moveaxis(lagging, 2, 0) / stiffness
         self._endless = np.full(n_cubes, np.inf)
@@ -189,16 +202,19 @@ class Thermal:
         """Return the errors (n, P, k) of the thermal stress on the pads of n cubes, in Pa.
 
         Each of the k columns is the error, of one standard deviation, by one of k independent
-        causes: the unknown temperature of the elastomer, its lag behind the thermometer, and the
-        coefficients of the calibration. If no temperature has been measured yet, the reference
+        causes: the unknown temperature of the elastomer, its lag behind the thermometer, the
+        coefficients of the calibration, and drift of the oscillators, which multiplies the load,
+        unless the calibration states it. If no temperature has been measured yet, the reference
         temperature is assumed, with a standard deviation of 5 K.
         """
         unknown = np.where(self._is_measured, self._unknown, LOST_KELVIN)
         powers = 1 + np.arange(self._deviation.shape[2])
+        load = np.nan_to_num(self._newest.reading - self._newest.subtracted)
         by_cause = (
             (self._coefficient[..., :1], unknown[:, None]),
             (self._ramp, self._behind),
             (self._deviation, self._level**powers),
+            ((self._drift * load)[..., None], self._level),
         )
         return np.concatenate([size[cubes] * by[cubes, None] for size, by in by_cause], axis=2)
 
