@@ -407,7 +407,7 @@ def test_cubes_that_fail_beside_a_contact_and_a_skin_without_values(inverse):
     assert tracker.update(np.full_like(values, np.nan), max_work=np.inf) == []
 
 
-@pytest.mark.parametrize("work_before", [1, np.inf], ids=["nodes", "Hertz contact"])
+@pytest.mark.parametrize("work_before", [1, np.inf], ids=["grid contacts", "Hertz contact"])
 def test_a_cube_that_fails_during_a_contact(inverse, work_before):
     """In the very next scan, the fit may not compute with values that are unknown since. Without
     noise, a ball has its force."""
@@ -448,8 +448,8 @@ def test_fingertips_edges_and_rods_have_their_force_and_place(shape, cubes, pitc
 @pytest.mark.parametrize("outside", [0.5, 1.0])
 @pytest.mark.parametrize(("shape", "limit"), [(BALL, 0.01), (make_bar(1e-2, 1e-3), 0.1)])
 def test_beyond_the_outermost_cubes_the_stated_deviation_grows(shape, limit, outside):
-    """No field is computed there. Without nodes beyond the border, the force of an edge was off by
-    a fifth, far more than stated. The fit is kept in the next scan."""
+    """No field is computed there. Without grid contacts beyond the border, the force of an edge
+    was off by a fifth, far more than stated. The fit is kept in the next scan."""
     bench = TractionBench(Setting(), side=2)
     random, force = np.random.default_rng(4), np.array([0.6, 0.3, -3.0])
     outermost = np.abs(bench.poses.position[:, 0]).max()
@@ -468,8 +468,8 @@ def test_beyond_the_outermost_cubes_the_stated_deviation_grows(shape, limit, out
 @pytest.mark.parametrize("cubes", CUBES[:2])
 @pytest.mark.parametrize("place", ["above a cube", "beside a cube", "outside a corner"])
 def test_a_ball_at_the_worst_places_of_a_wide_pitch_is_one_contact(cubes, place):
-    """Above a cube it hid between the points of the surface. Outside of a corner, nodes that no
-    cube feels made the sum of their forces a pull, which is no contact."""
+    """Above a cube it hid between the points of the surface. Outside of a corner, grid
+    contacts that no cube feels made the sum of their forces a pull, which is no contact."""
     wide = Setting(cubes=cubes, pitch=24e-3, depth=4e-3)
     bench = TractionBench(wide, side=None)
     corner = bench.poses.position[:, :2].max(axis=0)

@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Force, position, moment and area of a contact, with standard deviations.
 
-All are integrals of the traction over the nodes (small contacts) of a contact, or quotients of such
-integrals. Their variances follow from the covariance of the nodes' forces.
+All are integrals of the traction, or quotients of such integrals. The integrals are sums over the
+grid contacts (small Hertz contacts, grid_fit.py) of a contact, so their variances follow from the
+covariance of the forces of the grid contacts.
 """
 
 from __future__ import annotations
@@ -101,7 +102,7 @@ def make_discs(estimates: Sequence[ContactEstimate]) -> Discs:
 def compute_moment_polynomials(places: Array) -> Array:
     """Return 1, x, y, x^2, x y and y^2 (q, `N_MOMENTS`) at positions (q, 2).
 
-    Their sums over the nodes of a contact, weighted with the forces, are the moments.
+    Their sums over the grid contacts of a contact, weighted with the forces, are the moments.
     """
     x, y = places.T
     return np.stack([np.ones(len(x)), x, y, x**2, x * y, y**2], axis=1)
@@ -113,15 +114,15 @@ def estimate_contact(
     root: Array,
     size: float,
 ) -> ContactEstimate:
-    """Estimate one contact from the moments of the forces of its nodes (small Hertz contacts).
+    """Estimate one contact from the moments of the forces of its grid contacts (grid_fit.py).
 
     Args:
         centre: Position (2,) in m about which the moments are taken.
-        moments: Sums (3, `N_MOMENTS`) of the forces along x, y and z of the nodes, times each of
-            `compute_moment_polynomials`.
+        moments: Sums (3, `N_MOMENTS`) of the forces along x, y and z of the grid contacts, times
+            each of `compute_moment_polynomials`.
         root: Square root R (3, `N_MOMENTS`, k) of their covariance: with its first two axes joined,
             R R' is the covariance.
-        size: Radius of a node in m.
+        size: Radius of a grid contact in m.
     """
     force = moments[:, 0]
     force_x, force_y, force_z = force.tolist()
@@ -129,14 +130,15 @@ def estimate_contact(
     x, y, xx, xy, yy = (moments[2, 1:] / normal_force).tolist()
     moment = float(moments[1, 1] - moments[0, 2]) - x * force_y + y * force_x
 
-    # The second moment of the pressure is that of the forces at the nodes, plus that of the Hertz
-    # pressure of one node about its own centre. Its eigenvectors are the axes of the ellipse.
-    node_moment = _HERTZ_MOMENT * size**2
+    # The second moment of the pressure is that of the forces at the grid points, plus that of the
+    # pressure of one grid contact about its own centre. Its eigenvectors are the axes of the
+    # ellipse.
+    own_moment = _HERTZ_MOMENT * size**2
     xx, xy, yy = xx - x * x, xy - x * y, yy - y * y
     mean, half_difference = (xx + yy) / 2, (xx - yy) / 2
     radius = math.hypot(half_difference, xy)
-    larger_moment = max(mean + radius, 0.0) + node_moment
-    smaller_moment = max(mean - radius, 0.0) + node_moment
+    larger_moment = max(mean + radius, 0.0) + own_moment
+    smaller_moment = max(mean - radius, 0.0) + own_moment
     area = math.pi / _HERTZ_MOMENT * math.sqrt(larger_moment * smaller_moment)
     direction = math.atan2(xy, half_difference) / 2
     cosine, sine = math.cos(direction), math.sin(direction)
@@ -150,7 +152,7 @@ def estimate_contact(
     by_x = [-x, 1.0, 0.0, 0.0, 0.0, 0.0]
     by_y = [-y, 0.0, 1.0, 0.0, 0.0, 0.0]
     along, across = by_xx * x + by_xy * y, by_xy * x + by_yy * y
-    constant = x * along + y * across + node_moment * (by_xx + by_yy) - 2
+    constant = x * along + y * across + own_moment * (by_xx + by_yy) - 2
     by_area = [constant, -2 * along, -2 * across, by_xx, 2 * by_xy, by_yy]
     slopes = np.zeros((4, 3, N_MOMENTS))
     slopes[:, 2] = by_x, by_y, np.zeros(N_MOMENTS), by_area

@@ -5,14 +5,14 @@
 In every scan (set of values of all cubes), the linear inverse problem (inverse.py) yields the field
 of the pressure on the whole skin. Its connected regions of large pressure are the regions of
 contact (pressure_regions.py). The traction in each region is then fitted to the values of the cubes
-around it (tracked_region.py): as Hertz contacts, or as traction on nodes (small contacts on a grid)
-with a prior that is zero outside the region. Force, position, moment and area of each contact
-follow from this fit.
+around it (tracked_region.py): by one Hertz contact for each contact, or by grid contacts (many
+small contacts on a grid, grid_fit.py) with a prior that is zero outside the region. Force,
+position, moment and area of each contact follow from this fit.
 
 Fits take a few milliseconds, so the work in a scan is limited, and the remaining work is done in
 the next scans. Once they are fitted, Hertz contacts that move need one Gauss-Newton step per scan,
-and a fit on nodes only needs matrix products. A region that has no fit yet is reported with the
-integrals of the field, which are less exact.
+and a fit by grid contacts only needs matrix products. A region that has no fit yet is reported with
+the integrals of the field, which are less exact.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from ..inverse import FieldDeviation, SurfaceInverse, TractionField
 from ..surface import describe_contact
 from .contact_estimate import ContactEstimate
 from .fitted_field import add_fits
+from .grid_fit import GridFit
 from .hertz_fit import HertzFit, linearise
 from .local_values import CubeNoise, make_rotations_about_normal, unroll_points
-from .node_fit import NodeFit
 from .pressure_regions import PressureRegions
 from .tracked_region import (
     HOPELESS,
@@ -171,7 +171,7 @@ class ContactTracker:
         regions = self._regions
         self._noise.update(scaled, self._fitted_cubes)
         for region in regions:
-            region.drop_nodes_of_other_values()
+            region.drop_grid_of_other_values()
         self._update_fits()
 
         if len(self._fits) < len(regions):
@@ -206,7 +206,7 @@ class ContactTracker:
         return [region for region in self._regions if region.fit is not None]
 
     @property
-    def _fits(self) -> list[HertzFit | NodeFit]:
+    def _fits(self) -> list[HertzFit | GridFit]:
         """Fits of all regions that are fitted."""
         return [region.fit for region in self._regions if region.fit is not None]
 

@@ -17,9 +17,9 @@ from ...mechanics.contact import hertz
 from ...mechanics.layer import FIELD
 from ..inverse import FieldDeviation, SurfaceInverse, TractionField
 from .contact_estimate import ContactSum
+from .grid_fit import GridFit
 from .hertz_fit import HertzFit
 from .local_values import LocalValues, make_rotations_about_normal, unroll_points
-from .node_fit import NodeFit
 
 _MIN_RINGS = 4
 """Smallest number of concentric rings of point forces that represent a Hertz contact when its force
@@ -36,7 +36,7 @@ below the standard deviation of the pressure.
 
 def add_fits(
     inverse: SurfaceInverse,
-    fits: list[HertzFit | NodeFit],
+    fits: list[HertzFit | GridFit],
 ) -> tuple[TractionField, FieldDeviation]:
     """Add up the traction of the fits of all regions of contact, and its variances.
 

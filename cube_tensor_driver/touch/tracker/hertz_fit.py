@@ -3,10 +3,11 @@
 """Fit of Hertz contacts to the values of the cubes around a region of contact.
 
 A ball presses as a Hertz contact: force, centre and radius describe it with a few numbers, which
-the values of the cubes determine better than the forces of many nodes (node_fit.py), above all
-where the cubes are far apart. Gauss-Newton steps find the parameters x with the largest posterior.
-With the derivatives J of the whitened values by the parameters, the whitened residual r, the prior
-mean x0 and precision P of the parameters, and the misfit t (chi-squared per value, at least 1)::
+the values of the cubes determine better than the forces of many grid contacts (grid_fit.py), above
+all where the cubes are far apart. Gauss-Newton steps find the parameters x with the largest
+posterior. With the derivatives J of the whitened values by the parameters, the whitened residual r,
+the prior mean x0 and precision P of the parameters, and the misfit t (chi-squared per value, at
+least 1)::
 
     (J' J + P) change = J' r - P (x - x0),    covariance of x = t (J' J + P)^-1
 
@@ -259,7 +260,7 @@ class HertzFit:
     @property
     def score(self) -> float:
         """-2 ln of the evidence (probability of the values, in Laplace approximation), up to a
-        constant that is the same for `NodeFit.score` of a fit of the traction on nodes."""
+        constant that is the same for `GridFit.score` of a fit by grid contacts."""
         _, log_posterior_precision = np.linalg.slogdet(self.linear.information)
         log_prior_precision = np.log(self.linear.precision).sum()
         occam_term = log_posterior_precision - log_prior_precision

@@ -152,46 +152,47 @@ def _list_neighbours(tree: cKDTree, distance: float) -> Index:
 
 
 def split_peaks(pressure: Array, root: Array, is_neighbour: Mask) -> Index:
-    """Assign the nodes of a region to peaks of the pressure that are separated by valleys.
+    """Assign the grid points of a region to peaks of the pressure that are separated by valleys.
 
-    Nodes are small contacts on a grid. `VALLEY`, `MIN_FALL` and `MIN_PEAK` define what a peak is.
+    Grid points are the centres of grid contacts (grid_fit.py). `VALLEY`, `MIN_FALL` and `MIN_PEAK`
+    define what a peak is.
 
     Args:
-        pressure: Pressure (q,) at the nodes, in any unit.
+        pressure: Pressure (q,) at the grid points, in any unit.
         root: Square root R (q, n) of its covariance R R' (q, q), in the unit of the pressure.
-        is_neighbour: Whether two nodes are neighbours (q, q).
+        is_neighbour: Whether two grid points are neighbours (q, q).
 
     Returns:
-        Number (q,) of the peak of each node, from 0 on, the highest peak first.
+        Number (q,) of the peak of each grid point, from 0 on, the highest peak first.
     """
-    # The loop works on lists, because numpy takes long for the few neighbours of one node.
+    # The loop works on lists, because numpy takes long for the few neighbours of one point.
     n = len(pressure)
     owner = [-1] * n
     peaks: list[int] = []
     limit = MIN_PEAK * float(pressure.max())
     neighbours: list[list[int]] = [[] for _ in range(n)]
-    for node, other in np.argwhere(is_neighbour).tolist():
-        neighbours[node].append(other)
-    # Nodes are assigned in the order of falling pressure, each one to the peak of its neighbours. A
-    # node with neighbours of two peaks is the saddle point between these peaks.
-    for node in np.argsort(-pressure).tolist():
-        around = sorted({owner[other] for other in neighbours[node]} - {-1})
+    for point, other in np.argwhere(is_neighbour).tolist():
+        neighbours[point].append(other)
+    # Grid points are assigned in the order of falling pressure, each one to the peak of its
+    # neighbours. One with neighbours of two peaks is the saddle point between these peaks.
+    for point in np.argsort(-pressure).tolist():
+        around = sorted({owner[other] for other in neighbours[point]} - {-1})
         if not around:
-            if pressure[node] < limit and peaks:
+            if pressure[point] < limit and peaks:
                 continue
             around = [len(peaks)]
-            peaks.append(node)
+            peaks.append(point)
         first = around[0]
-        owner[node] = first
+        owner[point] = first
         for other in around[1:]:
             peak = peaks[other]
-            fall = pressure[peak] - pressure[node]
-            uncertainty = np.linalg.norm(root[peak] - root[node])
+            fall = pressure[peak] - pressure[point]
+            uncertainty = np.linalg.norm(root[peak] - root[point])
             relative_limit = (1 - VALLEY) * pressure[peak]
             significant_fall = MIN_FALL * uncertainty
             if fall < max(relative_limit, significant_fall):
                 owner = [first if one == other else one for one in owner]
-    # Nodes without an owner have too little pressure for a peak of their own, and had no neighbour
+    # Points without an owner have too little pressure for a peak of their own, and had no neighbour
     # that belongs to a peak. They are assigned to the highest peak.
     _, consecutive = np.unique(np.maximum(owner, 0), return_inverse=True)
     return np.asarray(consecutive.reshape(-1))

@@ -3,8 +3,9 @@
 """One region of contact, followed from scan to scan, and the steps that fit its traction.
 
 A scan is a set of values of all cubes. A fit is either one of Hertz contacts (hertz_fit.py), which
-is tried first and suffices for balls, or one of the traction on nodes (node_fit.py). Of the two,
-the one with the greater evidence (probability of the values) is kept.
+is tried first and suffices for balls, or one of grid contacts, small contacts on a grid whose sum
+is the traction (grid_fit.py). Of the two, the one with the greater evidence (probability of the
+values) is kept.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ import numpy as np
 from ...core.arrays import Array, Index
 from ..inverse import SurfaceInverse
 from .contact_estimate import ContactEstimate, Discs, make_discs
+from .grid_fit import GRID_STEP, MAX_GRID_CONTACTS, GridFit
 from .hertz_fit import HertzFit, linearise
 from .local_values import MIN_FACING, CubeNoise, LocalValues
-from .node_fit import MAX_NODES, NODE_STEP, NodeFit
 
 MAX_CUBES = 48
 """Largest number of cubes from whose values the traction in one region of contact is fitted. A
@@ -29,13 +30,15 @@ wider region, such as that of a palm, is not fitted: its force is the integral o
 the linear inverse problem yields."""
 
 NEAREST_CUBES = (21, 13, 9)
-"""Numbers of cubes nearest to each cube below a region of contact that take part in the fit of the
-traction on nodes. On a square grid they lie within 2.2, 2 and 1.4 pitches (distances of
-neighbouring cubes). The first number that does not give more than `MAX_CUBES` cubes is used."""
+"""Numbers of cubes nearest to each cube below a region of contact that take part in the fit by grid
+contacts (small contacts whose sum is the traction). In a square arrangement of cubes, the nearest
+ones lie within 2.2, 2 and 1.4 pitches (distances of neighbouring cubes). The first number that does
+not give more than `MAX_CUBES` cubes is used."""
 
 MAX_CHANGE = 0.25
 """Largest relative change of a region of contact for which the last fit of its traction stays in
-use. After a larger change, the traction on nodes (small contacts on a grid) is fitted again.
+use. After a larger change, the traction is fitted again by grid contacts (small contacts on a
+grid).
 
 The change is the largest of three numbers: the relative change of the region's largest pressure,
 the share of surface points that have joined the region, and the share that has left it. The fit
@@ -44,12 +47,13 @@ proportional to the stress.
 """
 
 MAX_OTHERS_CHANGE = 0.3
-"""Change of the stress that other regions cause in the cubes of a fit on nodes, above which the
-region is fitted again. It is the mean square of the change since the fit, in units of the noise.
+"""Change of the stress that other regions cause in the cubes of a fit by grid contacts (small
+contacts on a grid), above which the region is fitted again. It is the mean square of the change
+since the fit, in units of the noise.
 
 The first fits of regions that begin together each subtract an inexact estimate of the stress that
-the other regions cause. A narrow prior that was found with this estimate (`NodeFit.sharpen`) would
-keep the traction at wrong nodes.
+the other regions cause. A narrow prior that was found with this estimate (`GridFit.sharpen`) would
+keep the traction at wrong places.
 """
 
 MAX_MISFIT_GROWTH = 1.3
@@ -58,7 +62,7 @@ which the region is fitted again. The misfit grows when a contact moves or chang
 
 MAX_HERTZ_MISFIT = 1.5
 """Largest misfit (chi-squared per known value) of a fit of Hertz contacts at the cubes nearest to
-them. Above it, a fit of the traction on nodes (small contacts on a grid) is used instead.
+them. Above it, a fit by grid contacts (small contacts on a grid) is used instead.
 
 The misfit of the right model is 1 with a standard deviation of 0.12 for 9 cubes with 15 values
 each, and of 0.2 for planar cubes, whose pads lie in one plane and determine fewer values.
@@ -72,8 +76,8 @@ or one contact to two balls."""
 
 MAX_BAD_SCANS = 5
 """Number of successive scans (sets of values of all cubes) with too large a misfit (chi-squared per
-known value) after which a fit on nodes (small contacts on a grid) is tried instead of Hertz
-contacts.
+known value) after which a fit by grid contacts (small contacts on a grid) is tried instead of
+Hertz contacts.
 
 A misfit is too large if it exceeds `MAX_MISFIT_GROWTH` times the one of the first fit. One such
 scan does not suffice, because a new contact nearby also increases the misfit until its pressure is
@@ -87,13 +91,14 @@ to a small one."""
 
 MAX_HERTZ_ASPECT = 4.0
 """Largest ratio of length to width of a contact for which the fit of a round Hertz contact is
-tried. Length and width are those that the fit on nodes (small contacts on a grid) has found."""
+tried. Length and width are those that the fit by grid contacts (small contacts on a grid) has
+found."""
 
 MAX_DIRECT_PITCH = 2.5
 """Largest pitch (distance of neighbouring cubes), divided by the depth of the cubes' centres, at
 which the first fit of a region is that of a Hertz contact. This fit begins at the maximum of the
 pressure. At a larger pitch, it may end in a local optimum, on the wrong side of a cube, so the
-traction is fitted on nodes (small contacts on a grid) first."""
+traction is fitted by grid contacts (small contacts on a grid) first."""
 
 HOME_PITCHES = 0.55
 """Largest distance of Hertz contacts (of their mean centre) from their home cube, the cube around
@@ -146,9 +151,10 @@ class Work(IntEnum):
     """Next step of the fit of a region of contact. Steps with the smallest number are made first.
 
     MOVE makes a Gauss-Newton step of Hertz contacts. BEGIN makes the first fit of a Hertz contact.
-    PREPARE places nodes (small contacts on a grid); SOLVE and SETTLE fit the traction on them.
-    CHOOSE tries Hertz contacts instead of nodes. RENEW solves again for the same nodes. SHARPEN
-    repeats the fit with a narrower prior. NONE stands for a fit that needs no step.
+    PREPARE places grid contacts (small contacts on a grid); SOLVE and SETTLE fit the traction by
+    them. CHOOSE tries one Hertz contact for each contact instead. RENEW solves again for the same
+    grid contacts. SHARPEN repeats the fit with a narrower prior. NONE stands for a fit that needs
+    no step.
     """
 
     MOVE = 0
@@ -172,8 +178,9 @@ WORK_MS = {
     Work.RENEW: 6.0,
     Work.SHARPEN: 6.5,
 }
-"""Approximate CPU time, in ms, of the steps of a region with `MAX_NODES` nodes. The work in a scan
-is counted with these numbers, not with a clock, so that a recording gives the same contacts again.
+"""Approximate CPU time, in ms, of the steps of a region with `MAX_GRID_CONTACTS` grid contacts. The
+work in a scan is counted with these numbers, not with a clock, so that a recording gives the same
+contacts again.
 Fits that begin together (BEGIN) took 3 ms, plus 1.1 ms for each.
 """
 
@@ -207,7 +214,7 @@ class TrackedRegion:
         self.points: Index = np.zeros(0, np.intp)
         self.peak = 0.0
         self.near: list[TrackedRegion] = []
-        self.fit: HertzFit | NodeFit | None = None
+        self.fit: HertzFit | GridFit | None = None
         self.others: Array | float = 0.0
         self.gap = np.inf
         n_cubes = len(inverse.variant)
@@ -226,7 +233,7 @@ class TrackedRegion:
         self._first_misfit = 1.0
         self._is_direct = inverse.pitch < MAX_DIRECT_PITCH * inverse.depth
         self._is_hertz_due = self._is_direct
-        self._prepared: NodeFit | None = None
+        self._prepared: GridFit | None = None
         self._is_tried = False
         self._bad_scans = 0
         self._steps = 0
@@ -266,12 +273,12 @@ class TrackedRegion:
             fit.predict(extrapolates=not self.near)
             self._follow_home(fit)
 
-    def drop_nodes_of_other_values(self) -> None:
-        """Drop a fit on nodes (small contacts on a grid) if its cubes have lost or regained values.
+    def drop_grid_of_other_values(self) -> None:
+        """Drop a fit by grid contacts if its cubes have lost or regained values.
 
         The covariance of the forces was computed for the values that were known before.
         """
-        if isinstance(self.fit, NodeFit) and not self.fit.values.has_same_values:
+        if isinstance(self.fit, GridFit) and not self.fit.values.has_same_values:
             self.fit = None
 
     @property
@@ -302,7 +309,7 @@ class TrackedRegion:
         limit = MAX_MISFIT_GROWTH * self._first_misfit
         return self.fit is not None and self.fit.shape_misfit > limit
 
-    def _have_others_changed(self, fit: NodeFit) -> bool:
+    def _have_others_changed(self, fit: GridFit) -> bool:
         """Whether the stress that other regions cause in the cubes of a fit has changed by more
         than `MAX_OTHERS_CHANGE` since the fit was made."""
         values = fit.values
@@ -485,12 +492,12 @@ class TrackedRegion:
         if work in (Work.MOVE, Work.BEGIN, Work.CHOOSE):
             return WORK_MS[work]
         fit = self._prepared or self.fit
-        if isinstance(fit, NodeFit):
-            n_nodes = float(len(fit.places))
+        if isinstance(fit, GridFit):
+            n_grid_contacts = float(len(fit.places))
         else:
             area = len(self.points) * self._inverse.area
-            n_nodes = area / (NODE_STEP * self._inverse.depth) ** 2
-        return WORK_MS[work] * min(n_nodes / MAX_NODES, 1.0)
+            n_grid_contacts = area / (GRID_STEP * self._inverse.depth) ** 2
+        return WORK_MS[work] * min(n_grid_contacts / MAX_GRID_CONTACTS, 1.0)
 
     def improve(self, work: Work) -> None:
         """Make the next step of the fit, for the newest values.
@@ -501,20 +508,20 @@ class TrackedRegion:
         self.waited = 0
         fit = self.fit
         if work == Work.PREPARE:
-            self._prepare_nodes()
+            self._prepare_grid()
         elif work in (Work.SOLVE, Work.RENEW):
-            self._solve_nodes()
+            self._solve_grid()
         elif work == Work.SETTLE:
-            self._settle_nodes()
+            self._settle_grid()
         elif isinstance(fit, HertzFit):
             self._steps += 1
             before = fit.found
             iterate(self._inverse, [(fit, self._whiten(fit.values))], 1)
             if not fit.is_pressing:
                 fit.found = before
-        elif isinstance(fit, NodeFit) and work == Work.CHOOSE:
+        elif isinstance(fit, GridFit) and work == Work.CHOOSE:
             self._replace_by_hertz(fit)
-        elif isinstance(fit, NodeFit):
+        elif isinstance(fit, GridFit):
             fit.sharpen(self._whiten(fit.values))
             self._is_hertz_due = fit.is_sharp
             self._first_misfit = fit.misfit
@@ -603,8 +610,8 @@ class TrackedRegion:
         self.others = total - own
         values.disturbance = deviation - self.relative_error * np.abs(own)
 
-    def _prepare_nodes(self) -> None:
-        """Prepare a fit of the traction on nodes (small contacts on a grid).
+    def _prepare_grid(self) -> None:
+        """Prepare a fit of the traction by grid contacts (small contacts on a grid).
 
         If there are too many cubes or no known values, nothing is prepared.
         """
@@ -616,35 +623,35 @@ class TrackedRegion:
                 self._noise.update(self._noise.scaled, cubes)
                 values = self._collect(self.home, cubes)
                 if values.count:
-                    self._prepared = NodeFit(inverse, self.points, values)
+                    self._prepared = GridFit(inverse, self.points, values)
                 return
 
-    def _solve_nodes(self) -> None:
-        """Fit the traction on the prepared nodes, or else on those of the present fit again."""
+    def _solve_grid(self) -> None:
+        """Fit the forces of the prepared grid contacts, or else those of the present fit again."""
         self._is_tried = True
         fit = self._prepared or copy(self.fit)
         self._prepared = None
-        if isinstance(fit, NodeFit) and fit.values.has_same_values:
+        if isinstance(fit, GridFit) and fit.values.has_same_values:
             fit.values = copy(fit.values)
             fit.solve(self._whiten_newest(fit.values))
             self._prepared = fit
 
-    def _settle_nodes(self) -> None:
+    def _settle_grid(self) -> None:
         """Finish the fit that has been solved or sharpened, and keep it."""
         fit = self._prepared or self.fit
         self._prepared = None
-        if isinstance(fit, NodeFit) and fit.values.has_same_values:
+        if isinstance(fit, GridFit) and fit.values.has_same_values:
             self.subtract_others(fit.values, *self._respond(fit.values.cubes))
             fit.settle(self._whiten(fit.values))
             if fit is not self.fit:
                 self._is_hertz_due = not self._is_direct
                 self._accept(fit)
 
-    def _replace_by_hertz(self, nodes: NodeFit) -> None:
-        """Replace the fit on nodes by one Hertz contact for each of its contacts, if that increases
-        the evidence (probability of the values)."""
+    def _replace_by_hertz(self, grid_fit: GridFit) -> None:
+        """Replace the fit by grid contacts by one Hertz contact for each of its contacts, if that
+        increases the evidence (probability of the values)."""
         self._is_hertz_due = False
-        starts = nodes.estimate_contacts()
+        starts = grid_fit.estimate_contacts()
         largest_aspect = max(one.aspect for one in starts)
         if largest_aspect > MAX_HERTZ_ASPECT:
             return
@@ -652,15 +659,15 @@ class TrackedRegion:
         largest_size = MAX_START_SIZE * self._inverse.depth
         log_sizes = np.minimum(discs.log_sizes, np.log(largest_size))
         discs = discs._replace(log_sizes=log_sizes)
-        fit = HertzFit(self._inverse, nodes.values, discs)
+        fit = HertzFit(self._inverse, grid_fit.values, discs)
         iterate(self._inverse, [(fit, self._whiten(fit.values))], MAX_STEPS)
         # The evidence of all cubes can hide a misfit of the nearest cubes. So their misfit is
         # tested, too, except if there are other regions, whose contacts may cause it.
         is_round = fit.shape_misfit < MAX_HERTZ_MISFIT or np.isfinite(self.gap)
-        if is_round and not fit.is_unsettled and fit.score < nodes.score:
+        if is_round and not fit.is_unsettled and fit.score < grid_fit.score:
             self._accept(fit)
 
-    def _accept(self, fit: HertzFit | NodeFit) -> None:
+    def _accept(self, fit: HertzFit | GridFit) -> None:
         """Make `fit` the fit of this region, and store the state of the region at this fit.
 
         The state consists of the points of the surface, the largest pressure, the response to other

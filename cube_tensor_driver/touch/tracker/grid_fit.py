@@ -4,10 +4,12 @@
 
 The traction is different from zero only in the region, which is known from the pressure field of
 the linear inverse problem (pressure_regions.py). This knowledge makes integrals over the region far
-more exact than integrals of the field, whose prior is the same everywhere. The traction is the sum
-of small Hertz contacts on a grid of nodes. Let f be the forces of the nodes in N, B the whitened
-response of the cubes to them, w the whitened values and e their noise. The posterior is that of a
-Gaussian process::
+more exact than integrals of the field, whose prior is the same everywhere.
+
+The traction is modelled as the sum of grid contacts: small, equally wide Hertz contacts that are
+centred on the points of a square grid. Let f be the forces of the grid contacts in N, B the
+whitened response of the cubes to them, w the whitened values and e their noise. The posterior is
+that of a Gaussian process::
 
     w = B f + e,    f ~ N(0, s^2 K),    e ~ N(0, t)
     mean f = s^2 K B' W w,    covariance t (s^2 K - s^4 K B' W B K),    W = (1 + s^2 B K B')^-1
@@ -48,34 +50,35 @@ from .contact_estimate import (
 from .local_values import LocalValues, unroll_points
 from .pressure_regions import split_peaks
 
-NODE_STEP = 0.4
-"""Distance of neighbouring nodes (small contacts that make up the traction), divided by the depth
-of the cubes' centres. With 0.6 instead of 0.4, forces of narrow contacts are off by 0.5 % instead
-of 0.1 %."""
+GRID_STEP = 0.4
+"""Distance of neighbouring grid contacts (small contacts that make up the traction), divided by the
+depth of the cubes' centres. With 0.6 instead of 0.4, forces of narrow contacts are off by 0.5 %
+instead of 0.1 %."""
 
-MAX_NODES = 80
-"""Largest number of nodes (small contacts that make up the traction) of a fit, whose time grows
-with its third power. The nodes of larger regions lie farther apart."""
+MAX_GRID_CONTACTS = 80
+"""Largest number of grid contacts (small contacts that make up the traction) of a fit, whose time
+grows with its third power. The grid contacts of larger regions lie farther apart."""
 
 BORDER_REACH_PITCHES = 1.5
 """Distance from a region of contact at the border of the skin, divided by the pitch (distance of
-neighbouring cubes), up to which nodes (small contacts) are placed beyond the border. The region
-ends at the border, because it consists of points of the skin, but the contact may extend farther.
-"""
+neighbouring cubes), up to which grid contacts (small contacts that make up the traction) are placed
+beyond the border. The region ends at the border, because it consists of points of the skin, but the
+contact may extend farther."""
 
 MAX_BORDER_REACH_DEPTHS = 4.0
-"""Largest distance from a region of contact at which nodes (small contacts) are placed beyond the
-border of the skin, divided by the depth of the cubes' centres. Cubes do not feel the force of nodes
-much farther away, which would make the force of the contact arbitrary."""
+"""Largest distance from a region of contact at which grid contacts (small contacts that make up the
+traction) are placed beyond the border of the skin, divided by the depth of the cubes' centres.
+Cubes do not feel the force of grid contacts much farther away, which would make the force of the
+contact arbitrary."""
 
 ENVELOPE_FLOOR = 0.03
-"""Smallest prior standard deviation of the force of a node (one of the small contacts whose sum is
-the traction), divided by that of the strongest node.
+"""Smallest prior standard deviation of the force of a grid contact (one of the small contacts whose
+sum is the traction), divided by that of the strongest grid contact.
 
 A second fit of the same values gets prior standard deviations that are proportional to the forces
-of the first fit, smoothed over neighbouring nodes. Force that the first fit spread over nodes
-without contact then disappears. The limit lets the second fit find a little force where the first
-one found none.
+of the first fit, smoothed over neighbouring grid contacts. Force that the first fit spread over
+points where nothing touches the skin then disappears. The limit lets the second fit find a little
+force where the first one found none.
 """
 
 MIN_SCORE_GAIN = 1.0
@@ -83,10 +86,11 @@ MIN_SCORE_GAIN = 1.0
 present one. The evidence is the probability of the values, with the traction integrated over its
 prior."""
 
-_NODE_RADIUS = 0.36
-"""Radius of the Hertz contact of a node, divided by the depth of the cubes' centres: 0.9 times
-`NODE_STEP`. It is the same where nodes lie farther apart, because wider nodes would blur narrow
-edges, and because the cubes hardly feel the gaps between nodes that are up to a depth apart."""
+_GRID_CONTACT_RADIUS = 0.36
+"""Radius of a grid contact (one of the small contacts whose sum is the traction), divided by the
+depth of the cubes' centres: 0.9 times `GRID_STEP`. It is the same where grid contacts lie farther
+apart, because wider ones would blur narrow edges, and because the cubes hardly feel the gaps
+between contacts that are up to a depth apart."""
 
 _PEAK_WIDTH = 0.5
 """Standard deviation of the Gaussian that smooths the fitted pressure before its peaks are counted,
@@ -94,10 +98,10 @@ divided by the depth of the cubes' centres below the surface. Every peak of a re
 contact."""
 
 _POINT_MARGIN = 0.75
-"""Largest distance of a node (one of the small contacts whose sum is the traction) from the nearest
-point of its region of contact, divided by the distance of neighbouring points of the surface. Every
-point represents a square with half a diagonal of 0.71, so nodes may lie anywhere in these squares.
-"""
+"""Largest distance of a grid contact (one of the small contacts whose sum is the traction) from the
+nearest point of its region of contact, divided by the distance of neighbouring points of the
+surface. Every point represents a square with half a diagonal of 0.71, so grid contacts may lie
+anywhere in these squares."""
 
 _CORRELATION_LENGTHS = np.array([0.2, 0.8, 3.0])
 """Correlation lengths of the pressure in a contact, divided by the depth of the cubes' centres: for
@@ -116,23 +120,23 @@ _RELATIVE_DEVIATIONS = np.array([SHEAR_RATIO, SHEAR_RATIO, 1.0])
 
 
 MIN_SIGNAL_TO_NOISE = 1e-4
-"""Smallest ratio of prior variance to noise variance with which a combination of the nodes' forces
-is estimated from the values. Combinations with a smaller ratio keep their prior mean, 0, which
-saves half of the computing time."""
+"""Smallest ratio of prior variance to noise variance with which a combination of the forces of the
+grid contacts is estimated from the values. Combinations with a smaller ratio keep their prior mean,
+0, which saves half of the computing time."""
 
 
-class NodePosterior(NamedTuple):
-    """Posterior of the forces of q nodes (small contacts whose sum is the traction of a region).
+class GridPosterior(NamedTuple):
+    """Posterior of the forces of q grid contacts (small contacts whose sum is a region's traction).
 
     The k unknowns are the combinations of forces that the values determine, divided by their prior
-    standard deviations. The noise of the N values has variance 1 here; `NodeFit.misfit` multiplies
+    standard deviations. The noise of the N values has variance 1 here; `GridFit.misfit` multiplies
     the covariance.
 
     Attributes:
         response: Whitened response (k, N) to each unknown.
         shrinkage: Variance (k,) of each unknown after the values are known; 1 before.
-        to_forces: Matrix (3 q, k) from the unknowns to the forces of the nodes in N: along x of all
-            nodes, then along y, then along z.
+        to_forces: Matrix (3 q, k) from the unknowns to the forces of the grid contacts in N:
+            along x of all grid contacts, then along y, then along z.
         to_errors: Matrix (S - 1, N) from the values to the errors of the S properties of the
             elastomer (sensitivity.py) except the depth, in standard deviations.
         by_errors: Change (k, S - 1) of the product of `response` and the values for one standard
@@ -173,20 +177,20 @@ class _Scale(NamedTuple):
     occam_term: float
 
 
-class NodeFit:
-    """Traction in one region on a grid of nodes (small Hertz contacts).
+class GridFit:
+    """Traction in one region as the sum of grid contacts (small Hertz contacts on a grid).
 
-    `solve` computes the forces of the nodes, `settle` and `sharpen` compute their posterior, which
-    takes milliseconds each. `step` only multiplies the values of later scans by matrices of this
-    posterior.
+    `solve` computes the forces of the grid contacts, `settle` and `sharpen` compute their
+    posterior, which takes milliseconds each. `step` only multiplies the values of later scans by
+    matrices of this posterior.
 
     Attributes:
-        places: Positions (q, 2) of the nodes in m, on the skin laid flat.
-        spacing: Distance of neighbouring nodes in m.
-        size: Radius of the Hertz contact of a node in m.
+        places: Positions (q, 2) of the grid contacts in m, on the skin laid flat.
+        spacing: Distance of neighbouring grid contacts in m.
+        size: Radius of a grid contact in m.
         values: Noise and positions of n cubes around the region.
         posterior: Posterior of the forces.
-        forces: Forces (3, q) of the nodes along x, y and z, in N, for the newest values.
+        forces: Forces (3, q) of the grid contacts along x, y and z, in N, for the newest values.
         misfit: Chi-squared divided by the number of known values; at least 1. It multiplies the
             covariance of the forces.
         score: -2 ln of the evidence, up to a constant.
@@ -196,7 +200,7 @@ class NodeFit:
         is_sharp: Whether `sharpen` has found that a narrower prior has no greater evidence.
     """
 
-    posterior: NodePosterior
+    posterior: GridPosterior
     forces: Array
     misfit: float
     score: float
@@ -207,7 +211,7 @@ class NodeFit:
         points: Index,
         values: LocalValues,
     ) -> None:
-        """Compute the response of the cubes to the nodes.
+        """Compute the response of the cubes to the grid contacts.
 
         Args:
             inverse: Poses, points, noise and responses of the skin.
@@ -219,16 +223,16 @@ class NodeFit:
         around = np.flatnonzero(is_around)
         region_points = unroll_points(inverse, values.home, points)
         points_around = unroll_points(inverse, values.home, around)
-        self.places, self.spacing = _place_nodes(
+        self.places, self.spacing = _place_grid_contacts(
             region_points,
             points_around,
             inverse,
         )
-        self.size = _NODE_RADIUS * inverse.depth
+        self.size = _GRID_CONTACT_RADIUS * inverse.depth
         self._peak_width = _PEAK_WIDTH * inverse.depth
 
-        # The force of a node is its pressure times the square of the spacing, so covariances of
-        # forces contain the fourth power of the spacing.
+        # The force of a grid contact is its pressure times the square of the spacing, so
+        # covariances of forces contain the fourth power of the spacing.
         self._squared_distances = cdist(
             self.places,
             self.places,
@@ -251,7 +255,9 @@ class NodeFit:
         self.is_sharp = False
 
     def solve(self, white: Array) -> None:
-        """Compute the forces with the same prior for all nodes. `settle` computes their posterior.
+        """Compute the forces with the same prior for all grid contacts.
+
+        `settle` computes the posterior of the forces.
 
         Args:
             white: Values (n C,), C components of stress and gradient of each of n cubes,
@@ -289,8 +295,8 @@ class NodeFit:
     def sharpen(self, white: Array) -> None:
         """Fit again with a prior that allows less force where the present fit finds little force.
 
-        This removes force that the first fit spreads over nodes without contact. If the evidence of
-        the new fit is not clearly higher, the present fit is kept.
+        This removes force that the first fit spreads over points where nothing touches the skin. If
+        the evidence of the new fit is not clearly higher, the present fit is kept.
 
         Args:
             white: Whitened values (n C,), as for `solve`.
@@ -338,7 +344,7 @@ class NodeFit:
 
     @property
     def discs(self) -> Discs:
-        """Round Hertz contacts that act on distant cubes like the traction on the nodes."""
+        """Round Hertz contacts that act on distant cubes like the grid contacts."""
         if self._discs is None:
             self._discs = make_discs(self.estimate_contacts())
         return self._discs
@@ -347,9 +353,9 @@ class NodeFit:
         """Return force, centre, moment and area of each contact of the region, by integration."""
         if self._estimates:
             return self._estimates
-        # For second moments, the force of a node counts as spread over an area as wide as the
-        # distance of neighbouring nodes.
-        radius = _NODE_RADIUS / NODE_STEP * self.spacing
+        # For second moments, the force of a grid contact counts as spread over an area as wide as
+        # the distance of neighbouring grid contacts.
+        radius = _GRID_CONTACT_RADIUS / GRID_STEP * self.spacing
         for centre, polynomials, unit_root in self._contacts:
             root = np.sqrt(self.misfit) * unit_root
             estimate = estimate_contact(
@@ -365,14 +371,14 @@ class NodeFit:
     def shape_misfit(self) -> float:
         """Misfit that shows whether the model of the traction is wrong.
 
-        It is `misfit`, to which all cubes around the region contribute, because nodes assume no
-        shape of the contact. A `HertzFit` assumes a shape, and therefore computes `shape_misfit`
-        from the cubes nearest to its contacts.
+        It is `misfit`, to which all cubes around the region contribute, because grid contacts
+        assume no shape of the contact. A `HertzFit` assumes a shape, and therefore computes
+        `shape_misfit` from the cubes nearest to its contacts.
         """
         return self.misfit
 
     def to_contacts(self, step: float) -> ContactSum:
-        """Describe the traction as a sum of small Hertz contacts, one for each node.
+        """Describe the traction as the sum of the grid contacts.
 
         Args:
             step: Not used here; `HertzFit.to_contacts` needs it.
@@ -416,7 +422,7 @@ class NodeFit:
         root = np.hstack([exact_root, by_column[:, 1:] @ errors_root, by_depth])
         to_errors = columns[:, 2:].T - (projected[:, 2:].T * variances) @ to_amplitudes
         is_known = best.signal_to_noise > MIN_SIGNAL_TO_NOISE
-        self.posterior = NodePosterior(
+        self.posterior = GridPosterior(
             response=(scale * to_amplitudes[is_known]).astype(np.float32),
             shrinkage=variances[is_known] / scale**2,
             to_forces=scale * basis[:, is_known],
@@ -472,9 +478,9 @@ class NodeFit:
 
     @property
     def _envelope(self) -> Array:
-        """Prior standard deviations (q,) of the nodes' forces for `sharpen`, divided by the largest
-        one. Their squares are the expected squares of the normal forces in the present posterior,
-        smoothed over neighbouring nodes."""
+        """Prior standard deviations (q,) of the forces of the grid contacts for `sharpen`, divided
+        by the largest one. Their squares are the expected squares of the normal forces in the
+        present posterior, smoothed over neighbouring grid contacts."""
         normal_variance = self.misfit * (self.posterior.root[2] ** 2).sum(axis=1)
         mean_square = self.forces[2] ** 2 + normal_variance
         smoothing = np.exp(-self._squared_distances / (2 * self.spacing**2))
@@ -483,7 +489,7 @@ class NodeFit:
         return np.asarray(envelope.clip(ENVELOPE_FLOOR))
 
     def _separate_contacts(self) -> None:
-        """Assign each node to one of the peaks of the pressure; each peak is a contact."""
+        """Assign each grid contact to one of the peaks of the pressure; each peak is a contact."""
         exponents = self._squared_distances / (2 * self._peak_width**2)
         smoothing = np.exp(-exponents)
         root = self.posterior.root
@@ -498,8 +504,8 @@ class NodeFit:
         )
         self._estimates = []
         self._discs = None
-        # Each contact is described by its centre, the polynomials of its nodes, and a square root
-        # of the covariance of its moments.
+        # Each contact is described by its centre, the polynomials of its grid contacts, and a
+        # square root of the covariance of its moments.
         self._contacts = []
         for label in range(labels.max() + 1):
             own = labels == label
@@ -518,35 +524,36 @@ class NodeFit:
         design matrix D (n C, 3 q) contains the whitened values that each unknown causes.
 
         Args:
-            envelope: Prior standard deviation (q,) of the force of each of q nodes, divided by the
-                largest one.
+            envelope: Prior standard deviation (q,) of the force of each of q grid contacts, divided
+                by the largest one.
 
         Returns:
             Eigenvalues (3 q,) of D' D with the eigenvectors V (3 q, 3 q); the product V' D'; and
-            the matrix (3 q, 3 q) from amplitudes of the eigenvectors to the forces of the nodes.
+            the matrix (3 q, 3 q) from amplitudes of the eigenvectors to the forces of the grid
+            contacts.
         """
         covariance = self._covariance * np.outer(envelope, envelope)
         # Rounding errors could give the covariance a negative eigenvalue, and this tiny increase of
         # its diagonal prevents that.
-        n_nodes = len(covariance)
-        covariance[np.diag_indices(n_nodes)] *= 1 + 1e-8
+        n_grid_contacts = len(covariance)
+        covariance[np.diag_indices(n_grid_contacts)] *= 1 + 1e-8
         cholesky_factor = np.linalg.cholesky(covariance)
         axis_roots = _RELATIVE_DEVIATIONS[:, None, None] * cholesky_factor
-        by_axis = self._white_response.reshape(-1, 3, n_nodes).swapaxes(0, 1)
+        by_axis = self._white_response.reshape(-1, 3, n_grid_contacts).swapaxes(0, 1)
         design = np.concatenate(by_axis @ axis_roots, axis=1)
         eigenvalues, vectors = np.linalg.eigh(design.T @ design)
         # Rounding errors may make the smallest eigenvalues negative.
         eigenvalues = np.maximum(eigenvalues, 0)
-        basis = axis_roots @ vectors.reshape(3, n_nodes, -1)
-        return eigenvalues, vectors.T @ design.T, basis.reshape(3 * n_nodes, -1)
+        basis = axis_roots @ vectors.reshape(3, n_grid_contacts, -1)
+        return eigenvalues, vectors.T @ design.T, basis.reshape(3 * n_grid_contacts, -1)
 
 
-def _place_nodes(
+def _place_grid_contacts(
     region: Array,
     around: Array,
     inverse: SurfaceInverse,
 ) -> tuple[Array, float]:
-    """Place nodes (small contacts) on a region, and beyond the border of the skin next to it.
+    """Place grid contacts on a region, and beyond the border of the skin next to it.
 
     Args:
         region: Positions (n, 2) of the points of the region in m, on the skin laid flat.
@@ -554,8 +561,8 @@ def _place_nodes(
         inverse: Gives the depth and pitch of the cubes, and the spacing of the points.
 
     Returns:
-        Positions (q, 2) of at most `MAX_NODES` nodes in m, and the distance of neighbouring ones in
-        m.
+        Positions (q, 2) of at most `MAX_GRID_CONTACTS` grid contacts in m, and the distance of
+        neighbouring ones in m.
     """
     farthest = MAX_BORDER_REACH_DEPTHS * inverse.depth
     reach = min(BORDER_REACH_PITCHES * inverse.pitch, farthest)
@@ -563,22 +570,22 @@ def _place_nodes(
     centre = region.mean(axis=0)
     radius = np.abs(region - centre).max()
     extent = radius + reach
-    step = NODE_STEP * inverse.depth
+    step = GRID_STEP * inverse.depth
     while True:
         steps_each_way = int(np.ceil(extent / step))
         side = 2 * steps_each_way + 1
-        nodes = centre + make_square_points(step, side)
-        to_region = cdist(nodes, region).min(axis=1)
+        places = centre + make_square_points(step, side)
+        to_region = cdist(places, region).min(axis=1)
         is_within_reach = to_region < reach
-        nodes = nodes[is_within_reach]
+        places = places[is_within_reach]
         to_region = to_region[is_within_reach]
-        to_skin = cdist(nodes, around).min(axis=1)
+        to_skin = cdist(places, around).min(axis=1)
         is_beyond_border = to_skin > margin
         is_in_region = to_region < margin
-        nodes = nodes[is_in_region | is_beyond_border]
-        if len(nodes) <= MAX_NODES:
-            return nodes, step
-        # The number of nodes is proportional to 1 / step^2. The additional 2 % usually save a
-        # further iteration.
-        squared_growth = 1.02 * len(nodes) / MAX_NODES
+        places = places[is_in_region | is_beyond_border]
+        if len(places) <= MAX_GRID_CONTACTS:
+            return places, step
+        # The number of grid contacts is proportional to 1 / step^2. The additional 2 % usually save
+        # a further iteration.
+        squared_growth = 1.02 * len(places) / MAX_GRID_CONTACTS
         step *= np.sqrt(squared_growth)
