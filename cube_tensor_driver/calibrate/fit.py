@@ -4,7 +4,7 @@
 
     v_np = g_p sum_k c_k (B_k s_n)_p + noise
 
-    s_n   state (amplitudes of the modes, which are linear stress fields) of the known load n
+    s_n   amplitudes of the modes (linear stress fields) of the known load n
     v_np  stress that pad p measured under load n
     B_k   basis matrices (pads x modes) of the responses that the symmetry allows
     c_k   coefficients of the response
@@ -169,7 +169,7 @@ def loads_from_forces(
     force: Array,
     area: float,
 ) -> Array:
-    """Compute the states (amplitudes of the modes) of loads that are forces on a cube's face +z.
+    """Compute the amplitudes of the modes of loads that are forces on a cube's face +z.
 
     A reference sensor measured the forces. They are taken as a uniform stress with the components
     zz, yz and zx. The normal stresses along the skin, xx and yy, are taken as 0, because nothing
@@ -181,7 +181,7 @@ def loads_from_forces(
         area: Area that the forces act on, in m².
 
     Returns:
-        States (amplitudes of the modes) (N, M), in Pa.
+        Amplitudes of the modes (N, M), in Pa.
 
     Raises:
         FitError: The area is not above 0.
@@ -342,7 +342,7 @@ class _Model:
         All gains are taken as 1. The result has the shape (loads N, pads P, coefficients K).
 
         Args:
-            x: States (amplitudes of the modes) of the loads (N, M), in Pa.
+            x: Amplitudes of the modes of the loads (N, M), in Pa.
         """
         basis = self.structure.basis
         by_coefficient = np.tensordot(x, basis, axes=(1, 2))
@@ -552,7 +552,7 @@ def _advise(
     Args:
         model: The model.
         theta: Fitted parameters (coefficients, then coordinates of the gains).
-        x: States (amplitudes of the modes) of the given loads (N, M), in Pa.
+        x: Amplitudes of the modes of the given loads (N, M), in Pa.
         null: H independent changes of the parameters (parameters, H) that change no reading (stress
             on a pad under a load).
         is_open: For each coefficient that is not fixed, whether the loads leave it undetermined.

@@ -33,12 +33,13 @@ class Loads:
     """N known loads of a cube with P pads and M modes, and what was measured under them.
 
     Attributes:
-        state: Amplitudes of the modes (linear stress fields) that each load causes (N, M), in Pa.
+        amplitudes: Amplitudes (N, M) of the modes (linear stress fields) that each load causes, in
+            Pa.
         frequency: Frequencies of the pads under each load (N, P), in Hz.
         temperature: Temperature during each load (N,), in °C; None if it is unknown.
     """
 
-    state: Array
+    amplitudes: Array
     frequency: Array
     temperature: Array | None
 
@@ -47,7 +48,7 @@ class Loads:
 
         The result is None if the table has no row without load.
         """
-        is_unloaded = ~self.state.any(axis=1)
+        is_unloaded = ~self.amplitudes.any(axis=1)
         if not is_unloaded.any():
             return None
         unloaded = self.frequency[is_unloaded]
@@ -86,8 +87,8 @@ def read_loads(
     columns = dict(zip(header, cells.T, strict=True))
     by_pad = [columns[pad] for pad in layout.pads]
     frequency = np.stack(by_pad, axis=1)
-    state = _read_states(path, columns, modes, area)
-    return Loads(state, frequency, columns.get(TEMPERATURE))
+    amplitudes = _read_amplitudes(path, columns, modes, area)
+    return Loads(amplitudes, frequency, columns.get(TEMPERATURE))
 
 
 def _check_columns(
@@ -125,7 +126,7 @@ def _check_columns(
             )
 
 
-def _read_states(
+def _read_amplitudes(
     path: Path,
     columns: Mapping[str, Array],
     modes: Modes,
@@ -144,16 +145,16 @@ def _read_states(
             area.
     """
     forces = [name for name in FORCE if name in columns]
-    amplitudes = [name for name in modes.names if name in columns]
+    given_modes = [name for name in modes.names if name in columns]
     # Amplitudes of modes and forces both state the load, so they could contradict each other.
-    if bool(forces) == bool(amplitudes):
-        found = "both" if amplitudes else "neither"
+    if bool(forces) == bool(given_modes):
+        found = "both" if given_modes else "neither"
         raise FitError(
             f"{path}: found {found} columns of modes and of forces; "
             "give the load in one of the two ways"
         )
-    if amplitudes:
-        zero = np.zeros_like(columns[amplitudes[0]])
+    if given_modes:
+        zero = np.zeros_like(columns[given_modes[0]])
         by_mode = [columns.get(name, zero) for name in modes.names]
         return np.stack(by_mode, axis=1)
     if area is None:

@@ -221,11 +221,11 @@ def compute_expected_presses(
     rotated_stress = rotate_stress(stress, to_cube)
     rotated_gradient = rotate_gradient(to_gradient_tensor(slope), to_cube)
     scaled_gradient = rotated_gradient * calibration.half_side
-    state = calibration.modes.compute_amplitudes(
+    amplitudes = calibration.modes.compute_amplitudes(
         rotated_stress.reshape(-1, 6),
         scaled_gradient.reshape(-1, 3, 3, 3),
     )
-    on_pads: Array = state @ calibration.response.T
+    on_pads: Array = amplitudes @ calibration.response.T
     shape = (
         len(rotations),
         len(SIDES),

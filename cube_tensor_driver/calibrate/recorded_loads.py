@@ -93,7 +93,7 @@ def read_recorded_loads(
             number,
             layout.n_pads,
         )
-        reference_ns, state = _read_reference(
+        reference_ns, amplitudes = _read_reference(
             source.bag,
             reference,
             number,
@@ -123,13 +123,13 @@ def read_recorded_loads(
     # nanoseconds since 1970 exactly.
     seconds = (stamp_ns[used] - begin_ns) / SECOND
     known = (reference_ns - begin_ns) / SECOND
-    by_mode = [np.interp(seconds, known, amplitude) for amplitude in state.T]
-    states = np.stack(by_mode, axis=1)
+    by_mode = [np.interp(seconds, known, amplitude) for amplitude in amplitudes.T]
+    interpolated = np.stack(by_mode, axis=1)
     size = math.ceil(len(seconds) / MAX_LOADS)
     mean_temperature = average_neighbours(temperature[used], size)
     is_known = np.isfinite(mean_temperature)
     loads = Loads(
-        state=average_neighbours(states, size),
+        amplitudes=average_neighbours(interpolated, size),
         frequency=average_neighbours(frequency[used], size),
         temperature=mean_temperature if is_known.all() else None,
     )
@@ -215,7 +215,7 @@ def _read_reference(
         half_side: Half side of the cube, in m.
 
     Returns:
-        Times (N,) in ns, in rising order, and states (amplitudes of the modes) (N, M), in Pa.
+        Times (N,) in ns, in rising order, and amplitudes of the modes (N, M), in Pa.
 
     Raises:
         BagError: The topic is missing or has another type, has fewer than two messages with
@@ -267,13 +267,13 @@ def _read_reference(
     # field) that belongs to a gradient is the gradient times half the side of the cube.
     values[:, len(STRESS) :] *= half_side
     shape = (len(values), modes.n_modes)
-    state = np.zeros(shape)
-    for column, mode in zip(state.T, modes.names, strict=True):
+    amplitudes = np.zeros(shape)
+    for column, mode in zip(amplitudes.T, modes.names, strict=True):
         if mode in COMPONENTS:
             column[:] = values[:, COMPONENTS.index(mode)]
     # Components that the reference does not measure (NaN) are taken as 0, like the modes for which
     # it has no component.
-    return stamp_ns, np.nan_to_num(state)
+    return stamp_ns, np.nan_to_num(amplitudes)
 
 
 def _read_batches(

@@ -161,7 +161,7 @@ def run_table(options: argparse.Namespace) -> None:
 
     # Rows without load are left out of the fit, because they contain no information about the
     # response of the pads. Their average has given the rest frequencies.
-    loaded = loads.state.any(axis=1)
+    loaded = loads.amplitudes.any(axis=1)
     temperature = None if loads.temperature is None else loads.temperature[loaded]
     measured = compute_measured_stress(
         base,
@@ -171,7 +171,7 @@ def run_table(options: argparse.Namespace) -> None:
     structure = find_structure(layout, options.symmetry)
     result = fit(
         structure,
-        loads.state[loaded],
+        loads.amplitudes[loaded],
         measured,
         base.noise,
     )

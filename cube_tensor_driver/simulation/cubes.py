@@ -128,12 +128,12 @@ class SimulatedCubes:
         """
         pad_stress = np.empty((len(stress), self.n_pads))
         for calibration, rows in self._groups:
-            state = compute_true_amplitudes(
+            amplitudes = compute_true_amplitudes(
                 calibration,
                 stress[rows],
                 gradient[rows],
             )
-            pad_stress[rows] = state @ calibration.response.T
+            pad_stress[rows] = amplitudes @ calibration.response.T
         rest, beta, modulus = self._law
         rest = rest * (1 + self._drift * seconds)
         if self._thermal is not None:
@@ -354,11 +354,11 @@ def compute_skin_components(
     """
     components = np.empty((len(skin.cubes), len(COMPONENTS)))
     for calibration, rows in group_by_calibration(skin.calibrations):
-        state = compute_true_amplitudes(
+        amplitudes = compute_true_amplitudes(
             calibration,
             stress[rows],
             gradient[rows],
         )
-        in_pascal = state @ calibration.modes.components.T
+        in_pascal = amplitudes @ calibration.modes.components.T
         components[rows] = in_pascal * calibration.component_scale
     return components

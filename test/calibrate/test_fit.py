@@ -180,13 +180,13 @@ def test_readings_from_frequencies():
 
 
 def test_loads_from_a_reference_force_sensor():
-    states = loads_from_forces(SPACE, np.array([[1.0, 2, -3]]), 1e-4)
-    assert dict(zip(SPACE.names, states[0], strict=True)) | {
+    amplitudes = loads_from_forces(SPACE, np.array([[1.0, 2, -3]]), 1e-4)
+    assert dict(zip(SPACE.names, amplitudes[0], strict=True)) | {
         "zz": -3e4,
         "zx": 1e4,
         "yz": 2e4,
-    } == dict(zip(SPACE.names, states[0], strict=True))
-    assert np.count_nonzero(states) == 3
+    } == dict(zip(SPACE.names, amplitudes[0], strict=True))
+    assert np.count_nonzero(amplitudes) == 3
     with pytest.raises(FitError, match="area"):
         loads_from_forces(SPACE, np.ones((1, 3)), 0)
 

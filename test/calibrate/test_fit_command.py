@@ -43,22 +43,22 @@ def bench(seed: int, noise: float, loads: int, spread: float = 0.05, outliers: i
         gain=gain / gain.mean(),
         rest_frequency=100e3 * rng.uniform(0.95, 1.05, 8),
     )
-    state = np.vstack([np.zeros((3, 7)), rng.uniform(-10e3, 10e3, (loads, 7))])
-    v = state @ truth.response.T
+    amplitudes = np.vstack([np.zeros((3, 7)), rng.uniform(-10e3, 10e3, (loads, 7))])
+    v = amplitudes @ truth.response.T
     f = compute_pad_frequency(v, truth.rest_frequency, truth.beta, truth.modulus)
     # noise is 0.1 % of the readings' range, as a change of frequency
     f = f + noise * np.ptp(f - truth.rest_frequency) * rng.standard_normal(f.shape)
     for row in range(outliers):
         f[5 + row, row % 8] *= 1.2
-    return truth, state, f
+    return truth, amplitudes, f
 
 
-def write(path: Path, state: np.ndarray, frequency: np.ndarray, **change) -> Path:
+def write(path: Path, amplitudes: np.ndarray, frequency: np.ndarray, **change) -> Path:
     header = [*make_illustrative_calibration("planar").modes.names, *PLANAR.pads]
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(header)
-        writer.writerows(np.hstack([state, frequency]).tolist())
+        writer.writerows(np.hstack([amplitudes, frequency]).tolist())
     return path
 
 
@@ -76,8 +76,8 @@ def test_the_example_of_the_page_scatters_as_its_calibration_states(tmp_path):
 
 
 def test_a_bench_is_recovered_with_its_deviations(tmp_path):
-    truth, state, frequency = bench(0, noise=0.001, loads=20, outliers=2)
-    table = write(tmp_path / "loads.csv", state, frequency)
+    truth, amplitudes, frequency = bench(0, noise=0.001, loads=20, outliers=2)
+    table = write(tmp_path / "loads.csv", amplitudes, frequency)
     done = cube(
         "fit",
         table,
@@ -118,15 +118,15 @@ def test_a_bench_is_recovered_with_its_deviations(tmp_path):
 
 
 def test_loads_that_say_too_little_name_what_to_add(tmp_path):
-    _, state, frequency = bench(1, noise=0.001, loads=20)
-    state[:, 3:] = 0
+    _, amplitudes, frequency = bench(1, noise=0.001, loads=20)
+    amplitudes[:, 3:] = 0
     truth = make_illustrative_calibration("planar")
     frequency = compute_pad_frequency(
-        state @ truth.response.T, truth.rest_frequency, truth.beta, truth.modulus
+        amplitudes @ truth.response.T, truth.rest_frequency, truth.beta, truth.modulus
     )
     done = cube(
         "fit",
-        write(tmp_path / "l.csv", state, frequency),
+        write(tmp_path / "l.csv", amplitudes, frequency),
         "--layout",
         "planar",
         "-o",
@@ -184,7 +184,7 @@ def test_an_impossible_frequency_is_named(tmp_path, cell):
 def test_forces_become_tractions(tmp_path):
     loads = read_loads(table(tmp_path, f"fx,fy,fz,{PADS}\n1,2,-3,{ROW}\n"), PLANAR, area=1e-4)
     # zz, zx from fz and fx over 1 cm²; a planar cube has no mode for fy
-    np.testing.assert_allclose(loads.state, [[-30e3, 10e3, 0, 0, 0, 0, 0]])
+    np.testing.assert_allclose(loads.amplitudes, [[-30e3, 10e3, 0, 0, 0, 0, 0]])
 
 
 @pytest.mark.parametrize(
