@@ -339,7 +339,7 @@ static uint8_t close_run(
  * Noise may contain a zero at every other byte. A search for each zero would make it slower to decode
  * than good frames.
  *
- * data: 8 bytes at the begin of a run. */
+ * data: 8 bytes at the start of a run. */
 static size_t skip_short_runs(cube_decoder *decoder, const uint8_t *data) {
     uint64_t word = load_u64(data);
     /* The high bit is set in each byte that is zero in `word`, and all other bits are 0. */

@@ -116,7 +116,7 @@ def compute_interval_weights(
             from -1 to 1, symmetric about the centre. Each element has `order` equal steps.
         order: Order of the elements.
         parity: +1 when the traction is even about the centre, -1 when it is odd, 0 on a whole face.
-        start: Begin of the interval, -1 <= start < stop; the end of an element.
+        start: Start of the interval, -1 <= start < stop; the end of an element.
         stop: End of the interval, at most 1; the end of an element.
     """
     if parity:

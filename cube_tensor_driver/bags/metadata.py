@@ -322,10 +322,10 @@ def merge_connections(of_files: Iterable[Sequence[Connection]]) -> list[Connecti
 
 
 def _describe_time_span(start_ns: int, end_ns: int) -> dict[str, object]:
-    """Return begin and duration of a span of time with the keys of metadata.yaml.
+    """Return start and duration of a span of time with the keys of metadata.yaml.
 
     Args:
-        start_ns: Begin of the span, in ns since the Unix epoch.
+        start_ns: Start of the span, in ns since the Unix epoch.
         end_ns: End of the span, in ns since the Unix epoch.
     """
     return {

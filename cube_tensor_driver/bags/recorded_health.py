@@ -118,7 +118,7 @@ class RecordedHealthReader:
         more batches, and at most `MAX_DISORDER_NS` beyond the span.
 
         Args:
-            begin_ns: Begin of the span, in ns since the Unix epoch.
+            begin_ns: Start of the span, in ns since the Unix epoch.
             end_ns: End of the span, in ns since the Unix epoch.
         """
         if end_ns < self._last_wanted_ns - MAX_DISORDER_NS:

@@ -107,7 +107,7 @@ BLOCKS_PER_E_FOLD = 12
 the factor e (2.718). Averages over logarithmic intervals suffice, because creep slows down."""
 
 GAIN_TIME_S = 1.0
-"""Time, in s, from the begin of a load to the measurement of the pads' readings in a calibration of
+"""Time, in s, from the start of a load to the measurement of the pads' readings in a calibration of
 gains (sensitivities of the pads)."""
 
 MAX_RATE_HZ = 50.0
@@ -123,7 +123,7 @@ class CreepFit(NamedTuple):
         load: Mean reading of each pad while the load was held (P,), in Pa.
         hold_s: Duration for which the load was held, in s.
         misfit: Rms difference between measured and computed readings, divided by the load.
-        seconds: Times of averaged readings since the begin of the load (N,), in s.
+        seconds: Times of averaged readings since the start of the load (N,), in s.
         before: Measured creep (N, P), in Pa: averaged readings minus the first one under the load;
             after the load, the averaged readings themselves.
         after: Creep that the law does not explain (N, P), in Pa: averaged minus computed readings.
@@ -142,7 +142,7 @@ class _Hold(NamedTuple):
     """Readings of the pads under a load that is held, and after it, averaged over N blocks of time.
 
     Attributes:
-        time: Time since the begin of the load (N,), in s.
+        time: Time since the start of the load (N,), in s.
         is_loaded: 1 under the load, 0 after it (N,).
         n_readings: Number of readings in each block (N,).
         reading: Readings of the pads (N, P), in Pa.
@@ -313,7 +313,7 @@ def compute_step_reading(model: CreepModel, seconds: float) -> Array:
 def add_creep(calibration: Calibration, model: CreepModel) -> Calibration:
     """Return a calibration with a law of creep, and with gains reduced by the creep they contain.
 
-    The gains (sensitivities of the pads) were measured `GAIN_TIME_S` after the begin of a load, so
+    The gains (sensitivities of the pads) were measured `GAIN_TIME_S` after the start of a load, so
     they contain the creep until then. The compensation removes creep from the readings, so it must
     be removed from the gains, too.
 

@@ -285,7 +285,7 @@ def _search(data: Warming, degree: int, slope: Array) -> ThermalFit:
 def _find_lags(data: Warming, lags: Array) -> Array:
     """Return the measured temperature minus that after each of L low-pass filters (N, L), in K.
 
-    At the begin of each bag, both temperatures are equal.
+    At the start of each bag, both temperatures are equal.
 
     Args:
         data: Averages over N blocks of time.

@@ -84,7 +84,7 @@ def _make_action_schema(optional: JsonSchema, **required: JsonSchema) -> JsonSch
 
     Args:
         optional: Optional keys and the schemas of their values.
-        required: Required keys besides `from` and `to` (the times of begin and end).
+        required: Required keys besides `from` and `to` (the times of start and end).
     """
     needed: JsonSchema = {
         "from": _TIME,
@@ -180,8 +180,8 @@ class Action:
 
     Attributes:
         kind: press, slide, roll or tap.
-        start: Time at which it begins, in s from the begin of the script.
-        end: Time at which it ends, in s from the begin of the script.
+        start: Time at which it begins, in s from the start of the script.
+        end: Time at which it ends, in s from the start of the script.
         path: Positions of the indenter, (P, 3), in the unit that `Script.relative` states.
         force: Normal force on the skin, (K,), in N.
         shear: Tangential force on the skin, in N: (S, 3) values, or (1, 3) for the value at the
@@ -220,7 +220,7 @@ class Script:
     """The content of a load script, which states the forces on a simulated skin over time.
 
     Attributes:
-        period: Time, in s, after which the script starts from its begin again; None: it runs once.
+        period: Time, in s, after which the script runs again from its start; None: it runs once.
         depth: Depth of the cubes' centres below the surface of the skin, in m.
         young: Young's modulus of the elastomer of the skin, in Pa.
         poisson: Poisson's ratio of the elastomer of the skin.
@@ -238,7 +238,7 @@ class Script:
 
     @property
     def end(self) -> float:
-        """Time at which the last action ends, in s from the begin of the script."""
+        """Time at which the last action ends, in s from the start of the script."""
         return max(indenter.actions[-1].end for indenter in self.indenters)
 
 

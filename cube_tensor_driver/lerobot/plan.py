@@ -175,7 +175,7 @@ def plan_bag(path: Path, choices: Choices) -> BagPlan:
                 )
             # Interval 0 is the time before the first episode. Each episode adds one interval per
             # frame, and one for the time from its last frame to the next episode. Each interval
-            # but the first has one edge, its begin. So after n edges, interval n + 1 is the next.
+            # but the first has one edge, its start. So after n edges, interval n + 1 is the next.
             first = len(edges_ns) + 1
             frames = range(first, first + n_frames)
             blocks = [frames[k : k + fps] for k in range(0, n_frames, fps)]

@@ -292,7 +292,7 @@ class ImuMotion:
         The caller interpolates between these times.
 
         Args:
-            first_ns: Begin of the span, in ns since the Unix epoch.
+            first_ns: Start of the span, in ns since the Unix epoch.
             last_ns: End of the span, in ns since the Unix epoch.
 
         Raises:

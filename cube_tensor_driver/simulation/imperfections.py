@@ -51,7 +51,7 @@ MAX_SEED = (1 << 63) - 1
 """Largest seed of the random deviations of the pads: the largest signed 64-bit integer."""
 
 GROWTH_S = 600.0
-"""Time, in s, after the begin of a steady load. `Imperfections.creep_growth` states how much the
+"""Time, in s, after the start of a steady load. `Imperfections.creep_growth` states how much the
 stress that pads report has grown by creep until this time."""
 
 MAX_DEVIATIONS = 6
@@ -152,7 +152,7 @@ class Imperfections:
         creep: Terms (c, tau) of the creep: in addition to the stress, a pad reports c times the
             stress after a low-pass filter with the time constant tau, in s.
         creep_growth: Mean relative growth of the reported stress under a steady load, from 1 s to
-            `GROWTH_S` (600 s) after its begin, by creep with a power law. At 1 s the reported
+            `GROWTH_S` (600 s) after its start, by creep with a power law. At 1 s the reported
             stress is the true one, because pads are calibrated at about 1 s.
         creep_exponent: Exponent alpha of the power law, 0 to 1.
         creep_spread: Standard deviation of a pad's `creep_growth` divided by the mean.
@@ -207,8 +207,8 @@ class Imperfections:
             times = [time for time, *_ in getattr(self, name)]
             if times != sorted(set(times)):
                 raise ConfigError(f"{name}: found the times {times} s, allowed: rising times")
-        # The reported stress is the true one 1 s after the begin of a load, and smaller before.
-        # With a growth above the limit, it would be negative at the begin.
+        # The reported stress is the true one 1 s after the start of a load, and smaller before.
+        # With a growth above the limit, it would be negative at the start.
         max_growth = GROWTH_S**self.creep_exponent - 1
         max_spread = 1 + MAX_DEVIATIONS * self.creep_spread
         limit = max_growth / max_spread
@@ -287,7 +287,7 @@ class PadBehaviour:
             growth: Relative growth (cubes, pads) of the reported stress from 1 s to `GROWTH_S`.
             exponent: Exponent alpha of the power law.
         """
-        # The reported stress divided by the true one, at the time t in s after the begin of a
+        # The reported stress divided by the true one, at the time t in s after the start of a
         # steady load, is 1 + factor (t^alpha - 1).
         factor = growth / (GROWTH_S**exponent - 1)
         step = math.log(POWER_LAW_TIMES[1] / POWER_LAW_TIMES[0])

@@ -57,7 +57,7 @@ class SimulatedLink:
         frame_faults: Kinds of faults for the next SAMPLE frames (messages with a sample), one kind
             for each frame.
         held_back: Frame that is sent after the next one (fault `reorder`).
-        faults: Faults with a duration that act now, in the order of their begins.
+        faults: Faults with a duration that act now, in the order in which they began.
         first_readings: Fault of a pad -> frequency in mHz of the pad at the first sample after the
             fault began. The fault `stuck` repeats this frequency.
     """
@@ -77,7 +77,7 @@ class SimulatedLink:
         return HubSize(len(self.hub.cube_uids), self.hub.n_pads)
 
     def find_faults(self, *kinds: str) -> list[FaultRecord]:
-        """Return the faults of some kinds that act now, in the order of their begins."""
+        """Return the faults of some kinds that act now, in the order in which they began."""
         return [record for record in self.faults if record.fault.kind in kinds]
 
     def mark_damaged(self) -> None:
@@ -148,8 +148,8 @@ class Injector:
         self.records: list[FaultRecord] = []
         self._links = {link.name: link for link in links}
         self._random = np.random.default_rng(seed)
-        # Heap (priority queue) of begins and ends of faults. An entry has the simulated time in µs,
-        # whether it is a begin (at the same time, ends come first), a serial number, and the
+        # Heap (priority queue) of starts and ends of faults. An entry has the simulated time in µs,
+        # whether it is a start (at the same time, ends come first), a serial number, and the
         # function that begins or ends the fault.
         self._schedule: list[tuple[int, bool, int, Callable[[int], None]]] = []
         self._numbers = itertools.count()

@@ -273,7 +273,7 @@ class SampleTable:
         """Count the rows (samples of one cube) that the hubs took in an interval of time.
 
         Args:
-            start_ns: Begin of the interval, in ns since the Unix epoch.
+            start_ns: Start of the interval, in ns since the Unix epoch.
             end_ns: End of the interval (exclusive), in ns since the Unix epoch.
         """
         is_within = (self.time_ns >= start_ns) & (self.time_ns < end_ns)

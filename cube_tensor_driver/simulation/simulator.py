@@ -262,7 +262,7 @@ class Simulator:
         """Return the simulated time in µs at which the simulator has to act next.
 
         This is the earliest of the following times: the next sample of a hub, the next report
-        (HELLO and STATS), the next begin or end of a fault, and the end of a delay of bytes.
+        (HELLO and STATS), the next start or end of a fault, and the end of a delay of bytes.
 
         Args:
             report_us: Simulated time in µs of the next HELLO and STATS.

@@ -190,7 +190,7 @@ class WarmLayer:
         steps = self._rate * seconds
         decay = np.exp(-steps)
         # The steady state changes linearly with ground and air. The amplitudes lag behind it by
-        # `lag`, and their departure from it at the begin decays exponentially.
+        # `lag`, and their initial departure from it decays exponentially.
         lag = (steady - self._steady) * -np.expm1(-steps) / steps
         departure = self._amplitude - self._steady
         self._amplitude = steady + departure * decay - lag

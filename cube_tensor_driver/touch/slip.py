@@ -457,7 +457,7 @@ class SlipEstimator:
         """Return `Slip.partial` (n,) by the least-squares fit at the head of this file."""
         contacts = self._contacts
         terms, curved = contacts["terms"], contacts["terms"][:, 5:]
-        # The shear force has no component along the normal, and all sums are 0 at the begin of a
+        # The shear force has no component along the normal, and all sums are 0 at the start of a
         # fit. A small addition to the diagonal lets the matrix be inverted nevertheless.
         size = np.trace(contacts["gram"], axis1=1, axis2=2)[:, None, None]
         inverse = np.linalg.inv(contacts["gram"] + 1e-9 * (size + 1) * np.eye(8))

@@ -126,7 +126,7 @@ class Touches(NamedTuple):
     Attributes:
         stamp_ns: Time of the earliest sample of the scan, in ns of the source's clock.
         cube: Indices (m,) of the cubes with a larger pressure than their neighbours.
-        id: Numbers (m,) of the touches, which stay the same from begin to end: `stamp_ns` of the
+        id: Numbers (m,) of the touches, which stay the same from start to end: `stamp_ns` of the
             first scan of the touch, plus 1, 2, ... if several touches begin in the same scan.
         pressure: Pressure (m,) in Pa at the centre of this cube, without its slow part (an average
             that follows slow drift).

@@ -46,7 +46,7 @@ def list_time_exchanges(transcript: Transcript, state: str) -> list[TimeExchange
 
     Args:
         transcript: The conversation.
-        state: Begin of the name of the state: "before start", "started", "stopped", or "st" for
+        state: Start of the name of the state: "before start", "started", "stopped", or "st" for
             both of the latter.
     """
     trips = []

@@ -172,7 +172,7 @@ def test_forces_and_their_deviations(make_skin, layout, limit):
 
 
 def test_a_strong_load_is_one_touch_and_a_weak_one_beside_it_is_found(make_skin):
-    """10 N that also rub with 5 N: nothing else on the skin is touched, at its begin, for a second,
+    """10 N that also rub with 5 N: nothing else on the skin is touched, at its start, for a second,
     and after its end, although 1.5 % remain in the foam. 50 mN 55 mm away are found meanwhile."""
     run = Run(make_skin(12, known=True))
     strong = run.ball((5.0, 0.0, -10.0), (-2.6e-2, -2.8e-2))
@@ -183,7 +183,7 @@ def test_a_strong_load_is_one_touch_and_a_weak_one_beside_it_is_found(make_skin)
     assert {tuple(found.cube) for found in run.feed(1000, strong)} == {(strong_cube,)}
     both = run.feed(20, strong + weak)
     assert {tuple(found.cube) for found in both[1:]} == {(strong_cube, weak_cube)}
-    # its force is the less certain the more of what it is may be drift since the begin
+    # its force is the less certain the more of what it is may be drift since the start
     assert abs(both[-1].force[1, 2] + 0.05) < 3 * both[-1].force_uncertainty[1, 2]
     ended = run.feed(500, 0.015 * strong)
     assert not any(len(found.cube) for found in ended)

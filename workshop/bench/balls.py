@@ -19,7 +19,7 @@ MOVING_S = 2.0
 """Time, in s, in which each ball goes once around its circle, with a mean speed of 38 mm/s."""
 
 DELAY_S = 0.25
-"""Time, in s, from the begin of one ball to that of the next one."""
+"""Time, in s, from the start of one ball to that of the next one."""
 
 CIRCLE_RADIUS_M = 12e-3
 """Radius in m of the circle on which each ball moves."""

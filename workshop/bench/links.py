@@ -28,7 +28,7 @@ MAX_START_S = 10.0
 """Longest time, in seconds, from the start of the hubs until the first rows arrive."""
 
 SETTLE_S = 2.0
-"""Time, in seconds, from the first rows to the begin of the measurement."""
+"""Time, in seconds, from the first rows to the start of the measurement."""
 
 POLL_S = 0.05
 """Time, in seconds, between two checks of a condition that is waited for."""

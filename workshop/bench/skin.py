@@ -57,7 +57,7 @@ MAX_START_S = 30.0
 """Longest time, in seconds, from the start of the processes until the first tensor arrives."""
 
 SETTLE_S = 3.0
-"""Time, in seconds, from the first tensor to the begin of the measurement."""
+"""Time, in seconds, from the first tensor to the start of the measurement."""
 
 DRAIN_S = 1.0
 """Time, in seconds, after the measurement in which its last tensors arrive."""
@@ -102,7 +102,7 @@ class Measurement:
     """Processor time and memory that the processes used in a span of time.
 
     Attributes:
-        start_ns, end_ns: Begin and end of the span, in ns since the Unix epoch.
+        start_ns, end_ns: Start and end of the span, in ns since the Unix epoch.
         cpu_percent: Processor time in percent of one core, by process.
         memory_mb: Resident memory in MB every `MEMORY_PERIOD_S`, by process.
         first_tensor_s: Time from the start of the processes to the first message of stress.

@@ -40,7 +40,7 @@ MAX_START_S = 30.0
 """Longest time, in seconds, until the browser view has started."""
 
 SETTLE_S = 6.0
-"""Time, in seconds, from the start of the browser view to the begin of the measurement."""
+"""Time, in seconds, from the start of the browser view to the start of the measurement."""
 
 MEASURE_S = 15.0
 """Duration of the measurement of the views, in seconds."""

@@ -64,7 +64,7 @@ def check_frequencies(run: Run) -> FrequencyFindings:
     arrived = np.unique(keys)
     received = np.bincount(arrived // n_cubes, minlength=len(samples))
     is_checked = record.contains(samples.time_ns)
-    # Samples before the begin of the record are not missing: the driver was not active.
+    # Samples before the start of the record are not missing: the driver was not active.
     is_recorded = samples.time_ns >= record.begin_ns
     missing = np.where(is_recorded, samples.row_count - received, 0)
     is_lost = is_checked & (missing > 0) & ~_may_be_missing(run)

@@ -22,7 +22,7 @@ from .record import CUT_FAULTS, DRIVER_KILLS, NODE_STARTS, NS_PER_S, HubFault, S
 from .run import Findings, Run, count, find_matched
 
 EDGE_NS = 5_000_000
-"""Time, in nanoseconds, around the begin and around the end of a fault of a pad. A sample within it
+"""Time, in nanoseconds, around the start and around the end of a fault of a pad. A sample within it
 may have the fault or not, because the simulator sometimes carries faults out late."""
 
 STATUS_OF_FAULT = {
@@ -42,7 +42,7 @@ IMMEDIATE_FAULTS = ("open", "short", "report")
 """Kinds of faults of a pad that a single row (one sampling time) shows, without statistics."""
 
 DETECTION_NS = round(NS_PER_S * (2 * WINDOW_S + 0.1))
-"""Longest time, in nanoseconds, from the begin of a fault until it must be flagged, if finding it
+"""Longest time, in nanoseconds, from the start of a fault until it must be flagged, if finding it
 needs statistics.
 
 The time is two windows of the statistics (0.5 s each), and the scan that ends the second one.
@@ -69,11 +69,11 @@ RESTART_S = 2.0
 """Time, in seconds, before and after a start of a node in which its statistics are not complete."""
 
 NOMINAL_PERIOD_S = 1.5
-"""Time, in seconds, before and after the begin of a fault. The longest sampling period of the hubs
+"""Time, in seconds, before and after the start of a fault. The longest sampling period of the hubs
 within it gives the number of rows that are expected."""
 
 WINDOW_STEP_NS = 100_000_000
-"""Time, in nanoseconds, between the begins of two windows in which movement of pads is looked
+"""Time, in nanoseconds, between the starts of two windows in which movement of pads is looked
 for."""
 
 EXAMPLES = 4

@@ -60,7 +60,7 @@ They wait in its queues, which a busy host empties late.
 
 ROWS_AROUND_GAP = 100
 """Number of rows (one cube at one sampling time) before and after a gap in a topic whose stamps
-give the begin and the end of the gap."""
+give the start and the end of the gap."""
 
 GAP_MARGIN_S = 0.05
 """Longest time, in seconds, between the stamp of a row in a missing message and the stamps of the
@@ -195,7 +195,7 @@ class Samples:
 
         Args:
             kinds: Kinds of faults.
-            before_s: Time, in s, before the begin of a fault in which samples count, too.
+            before_s: Time, in s, before the start of a fault in which samples count, too.
             after_s: Time, in s, after its end in which samples count, too.
         """
         near = np.zeros(len(self), bool)

@@ -34,7 +34,7 @@ CYCLE_S = 30.0
 """Time, in seconds, after which the actions of `CYCLE` are repeated."""
 
 CYCLE = cast("dict[float, Event]", read_yaml(Path(__file__).with_name("cycle.yaml")))
-"""Events of each cycle, by time in seconds after its begin."""
+"""Events of each cycle, by time in seconds after its start."""
 
 FIRST_CYCLE_ONLY = ("restart reconstruction", "restart driver")
 """Actions of the first cycle only. They end the life of a process, over which the growth of its
@@ -52,7 +52,7 @@ QUIET_BEFORE_S = 4.0
 other fault."""
 
 QUIET_AFTER_S = 7.0
-"""Time, in seconds, after the begin of a "hold" (the load of a hub is kept constant) in which the
+"""Time, in seconds, after the start of a "hold" (the load of a hub is kept constant) in which the
 hub has no other fault."""
 
 OPENING_HUB = 2
@@ -63,7 +63,7 @@ OPENING_CUBES = (3, 4, 2, 5, 1)
 kind of fault. The load moves these cubes enough for a stuck pad to be found."""
 
 FIRST_CUT_S = 3.5
-"""Time, in seconds after the begin of a torture, of the earliest cut of a link."""
+"""Time, in seconds after the start of a torture, of the earliest cut of a link."""
 
 LAST_EVENT_S = 3.5
 """Length, in seconds, of the last part of a torture, in which no fault begins."""

@@ -51,7 +51,7 @@ class Overrides:
         calibration: Calibration that is used for every cube.
         skin: Skin whose calibrations are used. A recorded cube gets the calibration of the cube
             that has the same name in this skin.
-        tare: Begin and end of a time without load, in s after the start of the bag. The mean
+        tare: Start and end of a time without load, in s after the start of the bag. The mean
             frequencies in it become the rest frequencies.
     """
 
@@ -405,7 +405,7 @@ def _measure_rest(
         source: The recorded frequencies.
         settings: Calibrations, which state the effect of temperature, and rest frequencies, whose
             NaN states which pads a cube does not have.
-        begin_s: Begin of the span, in s after the start of the bag.
+        begin_s: Start of the span, in s after the start of the bag.
         end_s: End of the span, in s after the start of the bag.
 
     Returns:

@@ -117,7 +117,7 @@ class LowPass:
 
         Args:
             elapsed_s: Lengths of the intervals (C,), in s; 0 leaves the lags unchanged.
-            before: Inputs at the begin of the interval (C, P).
+            before: Inputs at the start of the interval (C, P).
             now: Inputs at its end (C, P); in between, they are straight lines.
             ahead_s: Time t after the interval (C,), in s, at which output + (slope + gain u) t is
                 exact; at other times, it is an approximation. Infinity makes slope and gain 0.

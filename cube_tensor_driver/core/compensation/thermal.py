@@ -165,7 +165,7 @@ class Thermal:
 
         Args:
             elapsed_s: Lengths of the intervals (C,), in s.
-            before: Measured temperatures at the begin of the intervals (C,), in °C.
+            before: Measured temperatures at the start of the intervals (C,), in °C.
             now: Measured temperatures at their end (C,), in °C.
 
         Returns:

@@ -91,7 +91,7 @@ class Health:
         self.high_residual = np.zeros(n_cubes, bool)
         self.history: deque[Window] = deque(maxlen=HISTORY_WINDOWS)
         self.closed = 0
-        # Number of rows of each cube from the last call of `collect` to the begin of the present
+        # Number of rows of each cube from the last call of `collect` to the start of the present
         # window; negative if the call was within this window.
         self._uncollected_rows = np.zeros(n_cubes, int)
         # Whether the residual of a cube was high at any time since the last call of `collect`.

@@ -181,7 +181,7 @@ class HealthState(NamedTuple):
     Attributes:
         words: Memory of `cubes` (C, 8), because numpy passes no structured arrays to C.
         quantities: Quantities of each pad (12, C, P), in the order of `PAD_QUANTITIES`.
-        window_ns: Begin and end of the present window of 0.5 s, and newest time stamp of the last
+        window_ns: Start and end of the present window of 0.5 s, and newest time stamp of the last
             scan (3,), in ns.
     """
 
@@ -212,7 +212,7 @@ class Offsets(NamedTuple):
     pads that a cube does not have are 0. The kernel changes the last four arrays.
 
     Attributes:
-        step_ns: Begin and end of the time step in which `offset`, `slope` and `gain` hold (2,), in
+        step_ns: Start and end of the time step in which `offset`, `slope` and `gain` hold (2,), in
             ns.
         since_ns: Time for each cube from which t is counted in the equation (C,), in ns.
         offset: Offsets by creep and temperature at the time `since_ns` (C, P).
