@@ -175,9 +175,9 @@ def _decompose(influence: Influence) -> tuple[Spectra, Array]:
         Spectra (Hankel transforms) of the components, and the matrix (2 n, P) from the real parts
         and then the imaginary parts of the components to the stresses of P pads.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(_N_DISTANCES)
+    abscissae, weights = np.polynomial.legendre.leggauss(_N_DISTANCES)
     half_reach = influence.reach / 2
-    r = (nodes + 1) * half_reach
+    r = (abscissae + 1) * half_reach
     weight = weights * half_reach
 
     # The functions of the distance r are weighted with sqrt(r dr). The square of a singular value

@@ -274,7 +274,7 @@ class Surface:
         joined = inside[first] & inside[second]
         joined_points = self._pairs[joined]
         patch_pairs = self.cube[joined_points].T
-        # Patches are the nodes of a graph; pairs of neighbouring points in contact are its edges.
+        # Patches are vertices of a graph; pairs of neighbouring points in contact are its edges.
         entries = np.ones(len(joined_points), bool)
         links = coo_matrix((entries, patch_pairs), shape=(n, n))
         _, component = connected_components(links, directed=False)
