@@ -194,7 +194,12 @@ def fit_recorded_creep(
     seconds = (stamp_ns - stamp_ns[:1]) / SECOND
     is_loaded = ~calibration.layout.is_dummy
     pads = tuple(itertools.compress(calibration.layout.pads, is_loaded))
-    result = fit_creep(seconds, reading[:, is_loaded], calibration.noise[is_loaded], pads)
+    result = fit_creep(
+        seconds,
+        reading[:, is_loaded],
+        calibration.noise[is_loaded],
+        pads,
+    )
     origin = f"{calibration.source}; creep fitted to {path.name}"
     # The amplitudes of dummy pads are 0.
     to_all = np.eye(n_pads)[:, is_loaded]

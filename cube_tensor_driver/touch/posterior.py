@@ -478,9 +478,17 @@ def _compute_cross_covariance(
     angles = np.repeat(angle, n_points)
     variants = np.repeat(model.variant, n_points)
 
-    traction = traction_prior.compute_traction_covariance(offset, angles, variants)
+    traction = traction_prior.compute_traction_covariance(
+        offset,
+        angles,
+        variants,
+    )
     traction = traction[:, columns].reshape(n, n_points, width, 3)
-    pressure = traction_prior.compute_pressure_covariance(offset, angles, variants)
+    pressure = traction_prior.compute_pressure_covariance(
+        offset,
+        angles,
+        variants,
+    )
     pressure = pressure[:, columns].reshape(n, n_points, width)
     cross = np.empty((n_points, ROWS_PER_POINT, n, width))
     # The axes of `cross` are the points, their results, the cubes and the components.

@@ -327,7 +327,11 @@ class SlipEstimator:
         # Eight coefficients need as many scans. A contact that moves begins again in every scan.
         is_determined = contacts["gram"][:, 0, 0] >= 8
         if is_determined.any():
-            contacts["partial"] = np.where(is_determined, self._estimate_partial_slip(), np.nan)
+            contacts["partial"] = np.where(
+                is_determined,
+                self._estimate_partial_slip(),
+                np.nan,
+            )
         normal = contacts["normal"]
         followed = self._follow(scaled)
         before = _compute_motion_states(followed, normal)

@@ -193,7 +193,14 @@ class ContactTracker:
             if isinstance(fit, HertzFit) and len(fit.found.forces) == 1
         }
         normals = inverse.poses.rotation[cubes, :, 2]
-        places = zip(ids, positions, normals, rotations, contacts, strict=True)
+        places = zip(
+            ids,
+            positions,
+            normals,
+            rotations,
+            contacts,
+            strict=True,
+        )
         found = [
             _describe_contact(number, position, normal, rotation, one, region.is_refined)
             for number, position, normal, rotation, (region, one) in places
@@ -338,7 +345,11 @@ class ContactTracker:
             fit = region.fit
             if fit is not None:
                 cubes = fit.values.cubes
-                region.subtract_others(fit.values, total[cubes], deviation[cubes])
+                region.subtract_others(
+                    fit.values,
+                    total[cubes],
+                    deviation[cubes],
+                )
                 before = region.response[cubes]
                 region.step()
                 total[cubes] += region.response[cubes] - before
@@ -518,7 +529,11 @@ class ContactTracker:
             local[number, :2] = x[cube], y[cube]
         to_cubes = make_rotations_about_normal(angles)
         in_cubes = local.copy()
-        in_cubes[:, :2] = np.einsum("nij,nj->ni", to_cubes[:, :2, :2], local[:, :2])
+        in_cubes[:, :2] = np.einsum(
+            "nij,nj->ni",
+            to_cubes[:, :2, :2],
+            local[:, :2],
+        )
         rotation = inverse.poses.rotation[cubes]
         positions = inverse.poses.position[cubes] + np.einsum("nij,nj->ni", rotation, in_cubes)
         return positions, cubes, rotation @ to_cubes

@@ -581,7 +581,11 @@ def _linearise_alike(
     columns[..., :n_contact_parameters] = of_contacts.reshape(*columns.shape[:3], -1)
     by_elastomer = inverse.select(sensitivity).reshape(*shape, quantities, -1).sum(axis=1)
     columns[..., n_contact_parameters:n_parameters] = by_elastomer.swapaxes(2, 3)
-    by_force = columns[..., :n_contact_parameters].reshape(*columns.shape[:3], contacts, -1)
+    by_force = columns[..., :n_contact_parameters].reshape(
+        *columns.shape[:3],
+        contacts,
+        -1,
+    )
     columns[..., -1] = np.einsum("kncjp,kjp->knc", by_force[..., :3], forces)
     whitening = np.array([fit.values.whitening for fit in fits])
     white = (whitening @ columns).reshape(n_fits, -1, n_parameters + 1)
@@ -591,7 +595,11 @@ def _linearise_alike(
     precision[:, :n_contact_parameters] = fits[0].contact_precision
     precision[:, n_contact_parameters:] = [[fit.elastomer_precision] for fit in fits]
     prior_offset = np.zeros_like(precision)
-    from_median = prior_offset[:, :n_contact_parameters].reshape(n_fits, contacts, -1)
+    from_median = prior_offset[:, :n_contact_parameters].reshape(
+        n_fits,
+        contacts,
+        -1,
+    )
     from_median[:, :, :3] = forces
     from_median[:, :, 5] = log_sizes - np.log(USUAL_SIZE * inverse.depth)
     information = jacobian.swapaxes(1, 2) @ jacobian

@@ -281,13 +281,23 @@ class LocalValues:
         angle = np.repeat(self.angle, count)
         variant = np.repeat(self.variant, count)
         contact_response = self._inverse.contact_response
-        response = contact_response.compute_response(offset, angle, variant, size)
+        response = contact_response.compute_response(
+            offset,
+            angle,
+            variant,
+            size,
+        )
         response = response[:, self._inverse.columns]
         by_contact = response.reshape(n, count, -1, 3)
         by_axis = by_contact.transpose(0, 2, 3, 1)
         return np.asarray(by_axis.reshape(*self.known.shape, -1))
 
-    def compute_sensitivity(self, centres: Array, size: float, forces: Array) -> Array:
+    def compute_sensitivity(
+        self,
+        centres: Array,
+        size: float,
+        forces: Array,
+    ) -> Array:
         """Compute how errors of the elastomer's properties change the response to Hertz contacts.
 
         The properties are the S quantities of mechanics/sensitivity.py: depth of the cubes,
@@ -311,7 +321,12 @@ class LocalValues:
         angle = np.repeat(self.angle, count)
         sizes = np.full(n * count, size)
         all_forces = np.tile(forces.T, (n, 1))
-        changes = response.compute_sensitivity(offset, angle, sizes, all_forces)
+        changes = response.compute_sensitivity(
+            offset,
+            angle,
+            sizes,
+            all_forces,
+        )
         changes = changes[:, :, self._inverse.columns]
         shape = n, count, *changes.shape[1:]
         by_contact = changes.reshape(shape)

@@ -567,7 +567,11 @@ class TrackedRegion:
         self._is_hertz_due = False
         self.waited = 0
         values = self._collect(home, self._inverse.near[home])
-        self.subtract_others(values, total[values.cubes], deviation[values.cubes])
+        self.subtract_others(
+            values,
+            total[values.cubes],
+            deviation[values.cubes],
+        )
         values.refresh()
         return HertzFit(self._inverse, values, self._start), self._whiten(values)
 
@@ -760,6 +764,10 @@ def _update_stale_responses(
     first = 0
     for region, at_cubes in stale:
         end = first + len(region.discs[1].forces) * len(at_cubes)
-        by_disc = measured[first:end].reshape(-1, len(at_cubes), measured.shape[1])
+        by_disc = measured[first:end].reshape(
+            -1,
+            len(at_cubes),
+            measured.shape[1],
+        )
         region.take_response(at_cubes, by_disc.sum(axis=0))
         first = end
