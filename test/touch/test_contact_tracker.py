@@ -342,10 +342,11 @@ def test_ten_balls_on_planar_cubes_have_their_forces(seed):
     assert 0.5 < np.sqrt(np.mean((error / stated) ** 2)) < 1.5
 
 
-def test_a_refined_contact_has_its_force_while_others_are_still_to_be_fitted():
+def test_contacts_have_their_force_while_others_are_still_to_be_fitted():
     """Twenty fingertips begin together, and the first fits subtract inexact estimates of the stress
-    that the others cause. Such fits, which do not count as refined, were off by 76 deviations.
-    Twenty refined ones in 90 scans may be off by more than the usual 4: by 3.3 when measured."""
+    that the others cause. Values that were whitened with other noise than the derivatives gave
+    forces that were off by 70 deviations. Twenty contacts in 100 scans may be off by more than the
+    usual 4: by 6.2 when measured, and with other seeds by 4.9 to 5.6."""
     bench = TractionBench(Setting(side=128e-3), side=2)
     random, centres = np.random.default_rng(1), []
     while len(centres) < 20:
@@ -358,11 +359,13 @@ def test_a_refined_contact_has_its_force_while_others_are_still_to_be_fitted():
     shape = np.concatenate([tip + centre for tip, centre in zip(tips, centres, strict=True)])
     values = compute_values_under(bench, shape, np.zeros(2), np.array([0, 0.9, -3.0]), random)
     tracker, errors = ContactTracker(bench.inverse, LEAST), []
-    for _ in range(90):
-        found = [one for one in tracker.update(values) if one.refined]
+    for _ in range(100):
+        found = tracker.update(values)
         errors += [(one.normal_force - 3) / one.force_uncertainty for one in found]
     assert len(found) == len(centres)
-    assert np.abs(errors).max() < 6
+    assert all(one.refined for one in found)
+    assert np.abs(errors).max() < 7
+    assert 0.5 < np.sqrt(np.mean(np.square(errors))) < 1.2
 
 
 def test_two_contacts_one_and_a_half_pitches_apart_are_told_apart_and_keep_their_ids(inverse):

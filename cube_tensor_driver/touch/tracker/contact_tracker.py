@@ -33,6 +33,7 @@ from .hertz_fit import HertzFit, linearise
 from .local_values import CubeNoise, make_rotations_about_normal, unroll_points
 from .pressure_regions import PressureRegions
 from .tracked_region import (
+    COARSE_DEVIATION,
     HOPELESS,
     MAX_STEPS,
     TrackedRegion,
@@ -61,15 +62,6 @@ MATCH_PITCHES = 1.0
 """Largest distance that a contact moves between two scans, divided by the pitch (distance of
 neighbouring cubes). A contact farther away from all previous ones is a new one."""
 
-COARSE_DEVIATION = 0.1
-"""Relative standard deviation that is stated for the force of a contact without a fit. Such a
-force is the integral of the pressure at the depth of the cubes, which the linear inverse problem of
-elasticity yields from the values of all cubes.
-
-These integrals were off by 1 to 12 % (rms) for balls, punches and rods on skins whose cubes are two
-or three depths (of their centres below the surface) apart.
-"""
-
 
 class TrackedContact(NamedTuple):
     """One contact in the skin's parent frame, with standard deviations.
@@ -91,7 +83,7 @@ class TrackedContact(NamedTuple):
         area_uncertainty: Standard deviation of the area, in m^2.
         refined: Whether force, position and moment come from a fit of the traction in the region of
             contact that agrees with the newest values, and all regions near it are fitted, too. If
-            not, they are less exact: integrals of the linear field (`COARSE_DEVIATION`), or results
+            not, they are less exact (`COARSE_DEVIATION`): integrals of the linear field, or results
             of a fit that is to be repeated.
     """
 
@@ -337,7 +329,10 @@ class ContactTracker:
         """
         fitted = self._fitted
         hertz_fits = [fit for fit in self._fits if isinstance(fit, HertzFit)]
-        linearise(self._inverse, [fit for fit in hertz_fits if fit.needs_linearisation])
+        due = [fit for fit in hertz_fits if fit.needs_linearisation]
+        for one in due:
+            one.values.refresh_if_stale()
+        linearise(self._inverse, due)
         if len(fitted) > 1:
             update_responses(self._inverse, fitted, self._fitted_cubes)
         total, deviation = self._sum_responses(slice(None))

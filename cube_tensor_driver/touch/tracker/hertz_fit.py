@@ -221,11 +221,11 @@ class HertzFit:
         return float(max(largest_shift, largest_growth))
 
     @property
-    def needs_linearisation(self) -> bool:
-        """Whether the response of the cubes must be linearised again before the next step.
+    def is_inexact(self) -> bool:
+        """Whether the linearised response of the cubes is not exact for the contacts found.
 
-        It must if the cubes or their noise have changed, if the `displacement` of the contacts is
-        at least `SETTLED_STEP`, or if the prior precision of the elastomer's errors exceeds
+        It is not if it is that of other cubes, if the `displacement` of the contacts is at least
+        `SETTLED_STEP`, or if the prior precision of the elastomer's errors exceeds
         `MAX_PRECISION_RATIO` times the misfit.
         """
         if self.linear.cubes is not self.values:
@@ -233,9 +233,13 @@ class HertzFit:
         if self.displacement >= SETTLED_STEP:
             return True
         elastomer_precision = self.linear.precision[-1]
-        if elastomer_precision > MAX_PRECISION_RATIO * self.misfit:
-            return True
-        return self.values.is_stale
+        return bool(elastomer_precision > MAX_PRECISION_RATIO * self.misfit)
+
+    @property
+    def needs_linearisation(self) -> bool:
+        """Whether the response of the cubes must be linearised again before the next step, because
+        it is inexact or the noise of the cubes has changed."""
+        return self.is_inexact or self.values.is_stale
 
     @property
     def is_unsettled(self) -> bool:
@@ -498,12 +502,11 @@ def linearise(inverse: SurfaceInverse, fits: Sequence[HertzFit]) -> None:
 
     Args:
         inverse: Responses (stress in the skin under contacts of unit force).
-        fits: Fits, whose attribute `linear` is set.
+        fits: Fits, whose attribute `linear` is set. The steps need values that are whitened with
+            the same noise, so the noise is not refreshed here.
     """
     by_shape: dict[tuple[int, int], list[HertzFit]] = {}
     for fit in fits:
-        if fit.values.is_stale:
-            fit.values.refresh()
         n_contacts = len(fit.found.forces)
         shape = n_contacts, len(fit.values.cubes)
         by_shape.setdefault(shape, []).append(fit)

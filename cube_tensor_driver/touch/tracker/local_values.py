@@ -245,6 +245,11 @@ class LocalValues:
         versions = self._noise.version[self.cubes]
         return not np.array_equal(self._versions, versions)
 
+    def refresh_if_stale(self) -> None:
+        """Refresh if the noise of the cubes or the disturbance has changed."""
+        if self.is_stale:
+            self.refresh()
+
     @property
     def has_same_values(self) -> bool:
         """Whether the known components of the cubes are the same as at the last `refresh`."""
