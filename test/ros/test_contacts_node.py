@@ -332,6 +332,7 @@ def test_contacts_of_an_uncertain_compensation_live_and_out_of_a_bag(ros, tmp_pa
         for number, hertz in enumerate(scans):
             send(hertz, STEP_NS if number else GAP_NS)
             ros.wait(lambda: read_stamp_ns(published["stress"][-1]) == now_ns)
+            ros.wait(lambda: is_answered(touches))
             next_ns = find_next_due_ns(now_ns, due_ns, round(1e9 / RATE_HZ))
             if next_ns is not None:
                 due_ns = next_ns
