@@ -60,7 +60,7 @@ def test_a_gap_is_not_made_up_for():
 
 @pytest.mark.parametrize("back", [0.001, 0.7, 1.0, 3.0, 1e7])
 def test_stamps_that_go_back_interrupt_it_for_two_periods_at_most(back):
-    """As of a clock that was set, or of a bag that is played again."""
+    """Stamps go back if a clock was set, or if a bag is played again."""
     step_ns = PERIOD_NS // 10
     first = START_NS + np.arange(1000) * step_ns
     again = first - int(back * PERIOD_NS) + first[-1] - first[0] + step_ns
