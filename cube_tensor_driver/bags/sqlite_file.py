@@ -56,10 +56,11 @@ def execute(
     sql: str,
     values: Sequence[object] = (),
 ) -> sqlite3.Cursor:
-    """Execute an SQL statement.
+    """Execute an SQL statement, and convert a UnicodeDecodeError to a `sqlite3.Error`.
 
     Raises:
-        sqlite3.Error: The database is damaged.
+        sqlite3.Error: The database is damaged; for some damaged texts, sqlite3 itself raises a
+            UnicodeDecodeError.
     """
     try:
         return database.execute(sql, values)

@@ -568,8 +568,8 @@ def _advise(
     # If an unknown coefficient was 0, it would cause no stress on its pads, and the gains of these
     # pads would seem undetermined, too. Any other value avoids this.
     theta[: len(names)][is_open] = 0.5
-    # A load that the advice adds has the rms amplitude of the given loads, because amplitudes of
-    # this size gave large enough signals.
+    # Each load that the user is advised to add has the rms amplitude of the given loads, because
+    # amplitudes of this size gave large enough signals.
     amplitudes = x[x != 0]
     size = np.sqrt(np.mean(amplitudes**2))
     single_modes = size * np.eye(x.shape[1])

@@ -252,7 +252,10 @@ def run_weight(options: argparse.Namespace) -> None:
 
 
 def run_creep(options: argparse.Namespace) -> None:
-    """Fit the creep of the foam to a bag with one press, print it and write the calibration."""
+    """Fit the creep of the pads' foam to a bag, print and draw it, and write the calibration.
+
+    In the bag, the cube is pressed once, and the load is held for some time.
+    """
     from ..calibrate.creep import compute_step_reading, fit_recorded_creep
     from ..views.figures.calibration import draw_correction
     from ..views.figures.style import save

@@ -64,7 +64,10 @@ distance of the line through this edge from the centre of the cube.
 
 The distance along the edge is counted from the point of the line that is nearest to the cube. An
 edge that reaches farther is cut off there, because traction farther away hardly causes any stress
-at the cube. With d and t as for `GRID_STEP`, the ratio is t / sqrt(1 + d**2).
+at the cube.
+
+The ratio is t / sqrt(1 + d**2), where t is the distance along the edge, and d that of the line from
+the point of the surface above the cube. Both are divided by the depth of the cube's centre.
 """
 
 _LAST_DISTANCE = REACH_DEPTHS * POINTS_PER_DEPTH

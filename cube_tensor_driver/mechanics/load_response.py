@@ -35,7 +35,8 @@ of the largest value of each component."""
 
 
 class LoadResponse:
-    """Table of the components that cubes at one depth measure under a Hertz contact with 1 N."""
+    """Table of the stress and gradient that cubes at one depth measure under a Hertz contact with
+    1 N, over the distance between contact and cube."""
 
     def __init__(
         self,

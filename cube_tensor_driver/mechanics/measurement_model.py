@@ -110,7 +110,8 @@ class CubeMeasurement:
 
         Args:
             components: Matrix (2 n, 15) from the real and imaginary parts of the n circular
-                components to the stresses, in Pa, and gradients, in Pa/m, that these cubes measure.
+                components (which describe the stress around a cube, see circular.py) to the
+                stresses, in Pa, and gradients, in Pa/m, that these cubes measure.
 
         Returns:
             Index of the variant in `matrices`.

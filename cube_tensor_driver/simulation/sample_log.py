@@ -193,7 +193,7 @@ class SampleLog:
     @cached_property
     def table(self) -> SampleTable:
         """All samples of the log, link after link, in the order of time."""
-        # The empty table gives the columns their type even if there are no runs.
+        # The empty table gives the columns their type even if no hub has taken a sample.
         parts = [np.empty((3, 0), np.int64)]
         link_of_cube = np.full(CUBE_RANGE, NO_LINK, np.int64)
         for index, link in enumerate(self.links):

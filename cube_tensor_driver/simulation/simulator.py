@@ -349,7 +349,8 @@ class StopRequest:
     """Request to end the simulator, which another thread or a signal makes."""
 
     def __init__(self) -> None:
-        # Latest monotonic time, in s, at which the simulator ends; infinite before a request.
+        # Monotonic time, in s, at which the simulator ends at the latest; infinite if nobody has
+        # requested that it ends.
         self._until_s = math.inf
 
     def request(

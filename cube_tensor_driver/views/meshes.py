@@ -22,7 +22,7 @@ NO_MESH: Mesh = (np.zeros((3, 3)), np.array([[0, 1, 2]]))
 _CORNERS = product((-1.0, 1.0), repeat=3)
 """Corners of a cube with its centre at the origin and half a side of 1."""
 _CORNER_PAIRS = np.array(list(combinations(_CORNERS, 2)))
-"""All pairs (28, 2, 3) of corners of the cube."""
+"""All pairs (28, 2, 3) of corners of the cube, of which 12 are the ends of its edges."""
 _N_DIFFERENT = np.count_nonzero(_CORNER_PAIRS[:, 0] != _CORNER_PAIRS[:, 1], axis=1)
 """Number (28,) of coordinates in which the corners of each pair differ: 1 along an edge."""
 CUBE_EDGES = _CORNER_PAIRS[_N_DIFFERENT == 1]

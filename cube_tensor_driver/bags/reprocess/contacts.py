@@ -161,7 +161,7 @@ class ContactWriter:
         recorded_ns: int,
         touches: Touches,
     ) -> None:
-        """Write the contacts and traction of the newest stress of each cube, if they are due.
+        """Write contacts and traction, computed from each cube's newest stress, if they are due.
 
         Between two due times, only the contacts are written, and only when one begins to slip.
 

@@ -44,11 +44,10 @@ HALVINGS = 10
 which converges quickly only for small arguments."""
 
 SERIES_TERMS = 9
-"""Number of terms of the Taylor series of 1 - exp(-x), where x is the ratio of a time to a time
-constant, divided by 2**`HALVINGS`.
+"""Number of terms of the Taylor series of 1 - exp(-x).
 
-Ratios are limited to 64, so x is at most 1/16. The first term that is left out is then 4e-18 of the
-sum.
+x is the ratio of a time to a time constant, limited to 64 and then halved `HALVINGS` times, so it
+is at most 1/16. The first term that is left out is then 4e-18 of the sum.
 """
 
 

@@ -82,7 +82,9 @@ class HubClock:
         self.line = ClockLine(self.track)
         self._step_us = 0  # suspected step of the hub's clock; 0 if none is
         self._steps_ns: deque[int] = deque(maxlen=MAX_STEPS)  # arrival times of the newest steps
-        self._doubtful_stamp = NEVER  # last stamp before a step was confirmed; may be too late
+        # Last stamp before the newest step of the hub's clock was confirmed. The step may have made
+        # it too late. Stamps never decrease, so new ones are in doubt until they exceed it.
+        self._doubtful_stamp = NEVER
         self._restart()
 
     @property

@@ -52,9 +52,10 @@ MAX_DELAY_NS = 60_000_000_000
 """Longest credible delay between sampling and arrival, in ns. If the clock line (host time over
 device time) gives a longer one, the arrival time is used as the stamp."""
 JITTER_POINTS = 64
-"""Time constant, in reads of the link, of the low-pass filter that estimates the jitter: the mean
-delay of the samples beyond the smallest delay, which is their height above the clock line (host
-time over device time)."""
+"""Time constant of the low-pass filter that estimates the jitter, in reads of the link. The jitter
+is the mean difference between a delay and the smallest delay. Each read adds the difference for its
+newest sample, which is the height of the sample above the clock line (host time over device
+time)."""
 
 
 class ClockLine:

@@ -146,15 +146,18 @@ class SkinWrenches:
 
 
 def make_state_interfaces(node: CubeNode, skin: Skin) -> StateInterfaces | None:
-    """Return the publisher of state interfaces; None if the parameter `hardware_name` is empty.
+    """Return the publisher of wrenches as state interfaces (controller inputs) of ros2_control.
 
     Args:
         node: The node `reconstruction`, which is being configured.
         skin: The skin.
 
+    Returns:
+        The publisher; None if the parameter `hardware_name` is empty.
+
     Raises:
-        CubeError: The skin has the same name as one of its cubes, or the package
-            pal_statistics_msgs is not installed.
+        CubeError: The skin has the same name as one of its cubes, so that their interfaces would
+            have the same names, or the package pal_statistics_msgs is not installed.
     """
     component = node.read_value("hardware_name")
     if not component:
