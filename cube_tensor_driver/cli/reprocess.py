@@ -43,7 +43,7 @@ def add_arguments(parser: Parser) -> None:
         nargs="*",
         metavar=("METHOD", "KEY:=VAL"),
         help="add touch, contacts and traction, as the nodes make them, with method:=METHOD "
-        "and its other parameters: depth:=0.005 thickness:=0.011 rate:=20",
+        "and its other parameters: least:=300 rate:=20 influence:=FILE",
     )
     parser.add_jobs()
 
@@ -64,7 +64,7 @@ def add_overrides(parser: Parser) -> None:
     parser.add_value(
         "--skin",
         "FILE",
-        "skin file with the calibrations to use, for cubes of the same names",
+        "skin file with the calibrations to use, for cubes of the same names, and the elastomer",
         Path,
     )
     parser.add_argument(
@@ -201,12 +201,8 @@ def read_contact_options(options: argparse.Namespace) -> ContactOptions | None:
     if method not in CONTACT_METHODS:
         raise ConfigError(f"--contacts {method}: the methods are {', '.join(CONTACT_METHODS)}")
 
-    # The option can set only those parameters of the node `contacts` that are numbers, and the
-    # influence table. The other parameters do not affect the computed contacts.
-    known = {}
-    for one in CONTACTS:
-        if one.span is not None or one.name == "influence":
-            known[one.name] = one
+    # The other parameters of the node `contacts` do not affect the computed contacts.
+    known = {one.name: one for one in CONTACTS if one.name in ("least", "rate", "influence")}
     values = {name: one.default for name, one in known.items()}
     for text in assignments:
         name, _, value = text.partition(":=")
@@ -216,9 +212,6 @@ def read_contact_options(options: argparse.Namespace) -> ContactOptions | None:
         refusal = known[name].find_refusal(values[name])
         if refusal:
             raise ConfigError(f"--contacts {text}: {refusal}")
-    rate = float(values.pop("rate"))
-    influence = str(values.pop("influence"))
-    numbers = {name: float(value) for name, value in values.items()}
-    settings = ContactSettings(method, influence=influence, **numbers)
-    settings.check()
-    return ContactOptions(settings, rate)
+    least, influence = float(values["least"]), str(values["influence"])
+    settings = ContactSettings(method, least, influence)
+    return ContactOptions(settings, float(values["rate"]))

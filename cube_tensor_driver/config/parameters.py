@@ -13,7 +13,7 @@ import re
 from collections.abc import Callable
 from typing import NamedTuple, cast
 
-from ..core.defaults import CONTACT_METHODS, CONTACT_PRESSURE, POISSONS_RATIO, SURFACE_DEPTH
+from ..core.defaults import CONTACT_METHODS, CONTACT_PRESSURE
 from ..core.modes import STRESS
 from .influence import find_influence_problem
 from .port import find_port_problem
@@ -294,14 +294,6 @@ Foxglove."""
 CONTACTS = (
     *SKIN_SUBSCRIBER,
     Parameter(
-        "depth",
-        0.0,
-        "Depth, in m, of the centres of the cubes below the surface of the skin. With 0 it is that "
-        f"of the `elastomer` in the skin file, or else {SURFACE_DEPTH:g}.",
-        span=(0.0, 1.0),
-        minimum=1e-5,
-    ),
-    Parameter(
         "least",
         CONTACT_PRESSURE,
         "Minimum pressure, in Pa, in the plane of the cubes that counts as contact.",
@@ -317,27 +309,12 @@ CONTACTS = (
         choices=", ".join(CONTACT_METHODS),
     ),
     Parameter(
-        "thickness",
-        0.0,
-        "Thickness, in m, of the elastomer on a rigid base, for the method inverse. With 0 it is "
-        "that in the skin file, or else infinite (a half space).",
-        span=(0.0, 1.0),
-    ),
-    Parameter(
-        "poisson",
-        0.0,
-        "Poisson's ratio of the elastomer, for the method inverse. With 0 it is that in the skin "
-        f"file, or else {POISSONS_RATIO:g}.",
-        span=(0.0, 0.5),
-    ),
-    Parameter(
         "influence",
         "",
         "Table of influence functions (response of each pad to a unit force at points of the "
         "surface), for the method inverse. It is the name of a table in the package, or a file "
-        "made by `./cube fem MODEL --load surface`. The table then replaces the parameters depth, "
-        "thickness and poisson. With an empty text each cube is taken as a point in a homogeneous "
-        "elastomer.",
+        "made by `./cube fem MODEL --load surface`. The table then replaces the `elastomer` of the "
+        "skin file. With an empty text each cube is taken as a point in a homogeneous elastomer.",
         problem=find_influence_problem,
     ),
 )

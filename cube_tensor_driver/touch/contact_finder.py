@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -67,53 +67,15 @@ class ContactSettings:
 
     Attributes:
         method: One of `CONTACT_METHODS`.
-        depth: Distance from the centres of the cubes to the surface, in m; 0: as the skin file
-            states, or else `SURFACE_DEPTH`.
         least: Smallest pressure in Pa, at the depth of the cubes, at which a contact is found.
-        thickness: Thickness of the elastomer on rigid ground in m; 0: as the skin file states, or
-            else a half space. Only the method inverse uses it.
-        poisson: Poisson's ratio of the elastomer; 0: as the skin file states, or else
-            `POISSONS_RATIO`. Only the method inverse uses it.
-        influence: Name of the file with the influence functions of the pads (influence.py),
-            whose depth, thickness and Poisson's ratio replace those of these settings. Empty: cubes
-            are modelled as points. Only the method inverse uses it.
+        influence: Name of the file with the influence functions of the pads (influence.py), whose
+            depth, thickness and Poisson's ratio replace those of the skin file. Empty: cubes are
+            modelled as points. Only the method inverse uses it.
     """
 
     method: str = AUTO
-    depth: float = 0.0
     least: float = CONTACT_PRESSURE
-    thickness: float = 0.0
-    poisson: float = 0.0
     influence: str = ""
-
-    def adapt_to_skin(self, stated: Elastomer | None) -> ContactSettings:
-        """Return these settings with the values of a skin file in place of `AUTO` and zeros.
-
-        Args:
-            stated: Elastomer of the skin file; None: the file does not describe it.
-        """
-        is_known = stated is not None or self.influence
-        automatic = INVERSE if is_known else INTERPOLATION
-        elastomer = stated or Elastomer(SURFACE_DEPTH, np.inf)
-        return replace(
-            self,
-            method=automatic if self.method == AUTO else self.method,
-            depth=self.depth or elastomer.depth,
-            thickness=self.thickness or elastomer.thickness,
-            poisson=self.poisson or elastomer.poisson,
-        )
-
-    def check(self) -> None:
-        """Check the settings as far as they do not depend on the skin.
-
-        Raises:
-            ElasticError: The depth exceeds the thickness.
-            ConfigError: There are no influence functions with this name.
-        """
-        if self.depth:
-            Layer(self.thickness or np.inf).check_depth(self.depth)
-        if self.influence:
-            find_influence(self.influence)
 
 
 class ContactFinder(Protocol):
@@ -190,27 +152,41 @@ def make_contact_finder(
     """Create the contact finder for one skin. With the method inverse, this takes seconds.
 
     Args:
-        settings: Method and properties of the elastomer that replace those of the skin file.
+        settings: Method and influence functions.
         poses: Poses of the cubes.
         calibrations: Calibration of each cube.
-        elastomer: Elastomer of the skin file; None: the file does not describe it.
+        elastomer: Elastomer of the skin file. None: the file does not describe it, so it is taken
+            as a half space in which the cubes lie `SURFACE_DEPTH` below the surface.
 
     Raises:
-        ElasticError: A setting is out of range, no cube observes any component, or the influence
-            functions belong to other cubes.
+        ElasticError: No cube observes any component, or the influence functions belong to other
+            cubes.
         ConfigError: The influence functions cannot be read.
     """
-    settings = settings.adapt_to_skin(elastomer)
-    if settings.method == INTERPOLATION:
-        return _InterpolationFinder(settings, poses)
-    return _InverseFinder(settings, poses, calibrations)
+    is_known = elastomer is not None or settings.influence
+    automatic = INVERSE if is_known else INTERPOLATION
+    method = automatic if settings.method == AUTO else settings.method
+    elastomer = elastomer or Elastomer(SURFACE_DEPTH, np.inf)
+    if method == INTERPOLATION:
+        return _InterpolationFinder(settings, poses, elastomer)
+    return _InverseFinder(
+        settings,
+        poses,
+        calibrations,
+        elastomer,
+    )
 
 
 class _InterpolationFinder:
     """Finds contacts in the pressure that is interpolated between the cubes (surface.py)."""
 
-    def __init__(self, settings: ContactSettings, poses: CubePoses) -> None:
-        self._surface = Surface(poses, settings.depth)
+    def __init__(
+        self,
+        settings: ContactSettings,
+        poses: CubePoses,
+        elastomer: Elastomer,
+    ) -> None:
+        self._surface = Surface(poses, elastomer.depth)
         self._threshold = settings.least
         self.contacts: list[Contact] = []
         self.slip = NO_CONTACTS
@@ -242,13 +218,14 @@ class _InverseFinder:
         settings: ContactSettings,
         poses: CubePoses,
         calibrations: Sequence[Calibration],
+        elastomer: Elastomer,
     ) -> None:
-        layer = Layer(settings.thickness, settings.poisson)
-        depth = settings.depth
+        layer = Layer(elastomer.thickness, elastomer.poisson)
+        depth = elastomer.depth
         model = None
         if settings.influence:
             influence = read_influence(find_influence(settings.influence))
-            # Influence functions are computed for one layer and depth, which replace the settings.
+            # Influence functions hold for one layer and depth, which replace those of the file.
             layer = influence.layer
             depth = influence.depth
             model = model_pads(influence, calibrations)

@@ -7,6 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from ...config.skin import Elastomer
 from ...core.arrays import Array
 from ...core.latest_stress import STALE_S, LatestStress
 from ...core.rate_limit import find_next_due_ns
@@ -37,7 +38,7 @@ class ContactOptions:
     """Options with which contacts are computed from the stress of a bag.
 
     Attributes:
-        settings: Method of contact estimation and its parameters.
+        settings: Method of contact estimation, its smallest pressure and influence functions.
         rate: Maximum rate of the computed messages of contacts, in Hz.
     """
 
@@ -57,6 +58,7 @@ class ContactWriter:
         writer: BagWriter,
         topics: str,
         options: ContactOptions,
+        elastomer: Elastomer | None,
     ) -> None:
         """Add the topics of touches, contacts and traction to a bag.
 
@@ -64,9 +66,11 @@ class ContactWriter:
             writer: The bag that is being written.
             topics: Common prefix of the names of the skin's topics, which ends in "/".
             options: Method of contact estimation, and rate of the messages.
+            elastomer: Elastomer of the skin; None: as recorded.
         """
         self._writer = writer
         self._settings = options.settings
+        self._elastomer = elastomer
         self._period_ns = round(1e9 / options.rate)
         self._contacts = f"{topics}contacts"
         self._traction = f"{topics}traction"
@@ -120,7 +124,7 @@ class ContactWriter:
                 self._settings,
                 read_cube_poses(info),
                 reconstructor.calibrations,
-                read_skin_elastomer(info),
+                self._elastomer or read_skin_elastomer(info),
             )
 
     def write(

@@ -49,8 +49,9 @@ class Overrides:
 
     Attributes:
         calibration: Calibration that is used for every cube.
-        skin: Skin whose calibrations are used. A recorded cube gets the calibration of the cube
-            that has the same name in this skin.
+        skin: Skin whose calibrations and elastomer are used. A recorded cube gets the calibration
+            of the cube that has the same name in this skin. The recorded elastomer is kept if the
+            skin states none.
         tare: Start and end of a time without load, in s after the start of the bag. The mean
             frequencies in it become the rest frequencies.
     """
@@ -308,7 +309,14 @@ def _write_skin(
         # Importing the models of contacts takes longer than reprocessing a small bag.
         from .contacts import ContactWriter
 
-        contacts = ContactWriter(writer, skin, job.contacts)
+        new_skin = job.overrides.skin
+        elastomer = None if new_skin is None else new_skin.elastomer
+        contacts = ContactWriter(
+            writer,
+            skin,
+            job.contacts,
+            elastomer,
+        )
     # How uncertain contacts are depends on the state of the compensation after each message.
     join = contacts is None or not _is_compensated(source, settings)
     for segment, stress, reconstructor in _reconstruct(source, settings, join=join):
