@@ -158,7 +158,7 @@ def find_cubes(
     path: Path,
     name: str | None,
 ) -> list[int]:
-    """Return the number of the cube with a given name, or of all cubes if the name is None.
+    """Return the index of the cube with a given name, or the indices of all cubes if it is None.
 
     Raises:
         BagError: No cube has the name.

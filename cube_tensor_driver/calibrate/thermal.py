@@ -94,9 +94,9 @@ for a quadratic part of 0.2 % of the effect per kelvin.
 """
 
 MAX_LAG_PATTERNS = 3
-"""Maximum number of columns of `ThermalModel.ramp`: errors of the pads' stresses, in Pa per K by
-which the elastomer's temperature lags behind the measured one. The columns are the first principal
-components of the residuals of the fit."""
+"""Maximum number of columns of `ThermalModel.ramp`. The columns are the largest principal
+components of the residuals of the fit: errors of the pads' stresses, in Pa per K of difference
+between the measured temperature and that of the elastomer."""
 
 
 @dataclass(frozen=True, eq=False)

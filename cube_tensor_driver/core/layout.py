@@ -150,7 +150,7 @@ class Layout:
 
     @cached_property
     def is_dummy(self) -> Mask:
-        """Whether each pad is a dummy pad (P,)."""
+        """Whether each pad (P,) is a dummy pad, whose frequency no load changes."""
         is_dummy: Mask = (self.normals == 0).all(axis=1)
         return is_dummy
 

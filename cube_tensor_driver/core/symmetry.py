@@ -77,11 +77,9 @@ _LETTERS = {
 pad to it. The names are the letters of Kiyota & Shinoda (eq. 1), who call this pad V1. The mode zx
 has equal stresses sigma_zx and sigma_xz, so its response is c + d."""
 _PAPER_LETTERS = _LETTERS | {"zx": ("c", -1), "xz": ("d", -1)}
-"""Name and sign of the coefficient of the first pad in each mode of Kiyota & Shinoda.
-
-Unlike in `_LETTERS`, the shear stresses sigma_zx and sigma_xz are independent there, and each has a
-coefficient of its own.
-"""
+"""Mode -> name and sign of the coefficient, as in `_LETTERS`, but for the eight modes `PAPER` of
+Kiyota & Shinoda. There, the shear stresses sigma_zx and sigma_xz are two modes, each with a
+coefficient of its own."""
 
 
 def generate_group(generators: Sequence[Matrix]) -> Index:

@@ -74,7 +74,8 @@ NO_ROWS = StressRows.from_values(
     np.empty((0, 6)),
     np.empty((0, 9)),
 )
-"""A table without rows, with which the list of the parts of a window begins."""
+"""A table without rows. The list of the parts of each window begins with it, because `concatenate`
+requires at least one table."""
 
 
 class LiveWindows:
@@ -259,7 +260,7 @@ class RecordedWindows:
                 self._frames[batch[NUMBER_COLUMN][0].as_py()] = batch
 
     def find(self, picture: AnyArray) -> dict[str, AnyArray]:
-        """Return the window that was recorded with a picture.
+        """Return the window (samples of one frame) whose number the squares in a picture show.
 
         Args:
             picture: Picture of the skin in a frame of the data set, (height, width, 3) or
@@ -269,7 +270,7 @@ class RecordedWindows:
             Features by the names that `./cube export lerobot` gives them, (samples, cubes, …) each.
 
         Raises:
-            BagError: The folder has no window with the number in the picture.
+            BagError: The folder has no window with this number.
         """
         return self.find_frame(read_frame_number(picture))
 

@@ -61,8 +61,9 @@ its frequency does not change or is noisy, or the hub reports the pad as failed 
 """
 
 MOMENTARY_FAULTS = (*FRAME_FAULTS, "reset", "wrap", "drift", "step")
-"""Kinds of faults without a duration: they end as soon as they have begun. All other kinds last for
-the time `seconds` of the fault."""
+"""Kinds of faults without a duration: they alter or lose a number of samples, restart the hub, or
+change the time or the rate of its clock without changing it back. All other kinds last for the time
+`seconds` of the fault."""
 
 _AMOUNT = make_number_schema("a number from 0 up", minimum=0)
 """Schema of a time in s, which is not negative. Only the size of a fault (`value`) may be negative:

@@ -320,7 +320,7 @@ def _find_tables(
     calibration: Numbers,
     bad: PadMasks,
 ) -> tuple[Numbers, Times]:
-    """Find the matrices of rows, by their calibrations and bad pads.
+    """Find the matrix that each of N rows needs for its calibration and its set of bad pads.
 
     Args:
         tables: Tables of the skin.
@@ -328,8 +328,8 @@ def _find_tables(
         bad: Bit masks of the bad pads (N,).
 
     Returns:
-        Numbers of the matrices (N,), and keys (see `Tables.keys`) of the matrices that do not
-        exist yet, `DONE` for all others (N,).
+        Index of the matrix of each row in `Tables.matrix` (N,), and its key (see `Tables.keys`) if
+        the matrix does not exist yet, otherwise `DONE` (N,).
     """
     key = calibration.astype(np.int64) << 32 | bad
     place = np.searchsorted(tables.keys, key)

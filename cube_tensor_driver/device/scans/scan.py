@@ -221,7 +221,9 @@ class ScanBuilder:
         return n_deferred + _count_rows(self._pending)
 
     def _take_scans(self, max_scans: int | None) -> list[_SampleRows]:
-        """Remove the oldest scans (one sample of each link); return their samples that have rows.
+        """Remove the oldest scans (one sample of each link), and return their samples.
+
+        Samples without any cube of the skin are left out.
 
         Args:
             max_scans: Largest number of scans to remove; None for all that can be built.

@@ -313,7 +313,7 @@ class LostMessages:
         return self._lost_earlier + max(self._lost_by_number, self._lost_by_dds)
 
     def begin_subscription(self) -> SubscriptionEventCallbacks:
-        """Begin to count for a new subscription.
+        """Begin to count the lost messages of a new subscription, in addition to those so far.
 
         Returns:
             The argument `event_callbacks` of `create_subscription`.
