@@ -37,14 +37,13 @@ class MeasurementModel(NamedTuple):
             components to the measured `COMPONENTS` in the frame of the cube, in Pa and Pa/m.
         variant: Index (cubes,) of the variant of each cube.
         pads: Matrix (variants, 2 n, P) from the real and imaginary parts of the circular components
-            to the stress of each pad, divided by the standard deviation of the pad's noise; None if
-            cubes are modelled as points.
+            to the stress of each pad, divided by the standard deviation of the pad's noise.
     """
 
     spectra: Spectra
     components: Array
     variant: Index
-    pads: Array | None = None
+    pads: Array
 
 
 class CubeMeasurement:

@@ -60,10 +60,8 @@ class TractionPrior:
     The first set-up for a layer takes about a second; later ones load the tables from the cache.
 
     Attributes:
-        variance: Prior variance (3,) of the traction along x, y and z, divided by the prior
-            variance of the pressure on the surface.
-        pressure_variance: Prior variance of the pressure at the depth of the cubes, divided by the
-            prior variance of the pressure on the surface.
+        variance: Prior variances (4,) of the traction along x, y and z and of the pressure at the
+            depth of the cubes, divided by the prior variance of the pressure on the surface.
         inputs: Arrays and numbers on which the covariances depend, as keys for the cache.
     """
 
@@ -78,14 +76,13 @@ class TractionPrior:
         """
         self._cubes = cubes
         self._table = DistanceTable(cubes.depth)
-        self.variance = np.array([SHEAR_RATIO**2, SHEAR_RATIO**2, 1.0])
         self.inputs = [*cubes.layer_inputs, cubes.matrices]
         tables = load_or_compute("prior", cubes.layer_inputs, self._tabulate)
         self._cross = tables["cross"]
         self._pressure = tables["pressure"]
         self._real = tables["real"]
         self._imaginary = tables["imaginary"]
-        self.pressure_variance = float(tables["own"])
+        self.variance = np.array([SHEAR_RATIO**2, SHEAR_RATIO**2, 1.0, tables["own"]])
 
     def _tabulate(self) -> dict[str, Array]:
         """Compute the covariances of the n circular components at the tabulated distances.
@@ -142,28 +139,34 @@ class TractionPrior:
             "own": own[0, _CIRCULAR_ZZ, _CIRCULAR_ZZ],
         }
 
-    def compute_traction_covariance(
+    def compute_surface_covariance(
         self,
         place: Array,
         angle: Array,
         variant: Index,
     ) -> Array:
-        """Compute the prior covariance of the measured components with the traction at one point.
+        """Compute the prior covariance of the measured components with the load at one point.
 
         Args:
-            place: Positions (N, 2) of the cubes from the point, in m.
+            place: Positions (N, 2) of the cubes from the point of the surface, in m.
             angle: Rotations (N,) of the cubes about z, in rad.
             variant: Index (N,) of each cube's variant in the measurement model.
 
         Returns:
-            Covariance (N, 15, 3) for a pressure of variance 1 Pa^2.
+            Covariance (N, 15, 4) with the traction along x, y and z, and with the pressure below
+            the point at the depth of the cubes, for a surface pressure of variance 1 Pa^2.
         """
         distance, direction = to_polar(place)
+        relative = direction - angle
         parts = self._table.interpolate(self._cross, distance)
         order = self._cubes.spectra.order
-        circular = rotate_loads(parts, direction, direction - angle, order)
-        measured = self._cubes.measure(circular, variant)
-        return np.asarray(measured.swapaxes(1, 2))
+        circular = rotate_loads(parts, direction, relative, order)
+        with_traction = self._cubes.measure(circular, variant).swapaxes(1, 2)
+
+        real, _ = self._cubes.compute_matrices(relative, variant)
+        pressure = self._table.interpolate(self._pressure, distance)
+        with_pressure = real @ pressure[:, :, None]
+        return np.concatenate([with_traction, with_pressure], axis=2)
 
     def compute_covariance(
         self,
@@ -196,31 +199,6 @@ class TractionPrior:
             circular = self._table.interpolate(table, distance)
             total += left @ circular @ right.swapaxes(1, 2)
         return total
-
-    def compute_pressure_covariance(
-        self,
-        place: Array,
-        angle: Array,
-        variant: Index,
-    ) -> Array:
-        """Compute the prior covariance of measured components with the pressure below one point.
-
-        The components are those that a cube measures: 6 stresses, and 9 gradients of normal stress.
-        The pressure is taken at the depth of the cubes, below one point of the surface.
-
-        Args:
-            place: Positions (N, 2) of the cubes from the point, in m.
-            angle: Rotations (N,) of the cubes about z, in rad.
-            variant: Index (N,) of each cube's variant in the measurement model.
-
-        Returns:
-            Covariance (N, 15) for a surface pressure of variance 1 Pa^2.
-        """
-        distance, direction = to_polar(place)
-        covariance = self._table.interpolate(self._pressure, distance)
-        real, _ = self._cubes.compute_matrices(direction - angle, variant)
-        measured = real @ covariance[:, :, None]
-        return np.asarray(measured[:, :, 0])
 
 
 def _compute_prior_spectrum(wavenumber: Array) -> Array:

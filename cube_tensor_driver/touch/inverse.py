@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..config.skin import Elastomer, Skin, as_skin
-from ..core.arrays import Array, Index, Single
+from ..core.arrays import Array, Index
 from ..core.defaults import SURFACE_DEPTH
 from ..core.errors import ElasticError
 from ..core.modes import COMPONENTS, STRESS
@@ -27,9 +27,9 @@ from ..mechanics.measurement_model import CubeMeasurement, MeasurementModel
 from ..mechanics.traction_prior import TractionPrior
 from .pad_measurement import model_pads
 from .pad_noise import GAIN_ERROR, compute_noise_of_all_pads, make_stress_matrices
-from .posterior import ObservationModel, WindowPosteriors
-from .prediction import MissingValuePrediction
-from .surface import place_patches
+from .posterior import WindowPosteriors
+from .prediction import CubePrediction
+from .surface import make_square_points, place_patches
 from .unrolled_skin import unroll
 
 MAX_PITCH_OF_FOUR_POINTS = 3.25
@@ -240,36 +240,26 @@ class SurfaceInverse:
         # comparable.
         is_stress = self.columns < len(STRESS)
         self._unit_factors = np.where(is_stress, 1.0, scale)
-        self.by_pad = by_pad[:, self.columns] * self._unit_factors[:, None]
-        self._all_pads = self.by_pad.copy()
+        self._all_pads = by_pad[:, self.columns] * self._unit_factors[:, None]
+        self.by_pad = self._all_pads.copy()
 
-        # `_whole_variant` is the variant of each cube in the measurement model while it uses all of
-        # its pads. A cube gets another variant when some of its pads are left out.
-        self._whole_variant = np.zeros(n, np.intp) if model is None else model.variant
-        self._variant_pads = None if model is None else model.pads
-        self.variant = self._whole_variant.copy()
-        self._has_other_pads = np.zeros(n, bool)
+        # A cube gets another variant in the measurement model while some of its pads are left out.
+        self._model = model
+        self.variant = np.zeros(n, np.intp) if model is None else model.variant.copy()
+        self._usable = self.observed
 
-        observation = ObservationModel(
-            self.columns,
-            self.observed,
-            self._all_pads,
-            self._whole_variant,
-        )
         self._windows = WindowPosteriors(
             TractionPrior(self._cubes),
             poses,
-            observation,
-            self.spacing,
-            side,
+            self.columns,
+            self.by_pad,
+            self.variant,
+            make_square_points(self.spacing, side),
         )
         self.near = self._windows.near
+        self._pressure_gain = self._windows.matrices.gain[:, :, 3].copy()
         self._known = self.observed
-        self._prediction = MissingValuePrediction(
-            self._windows,
-            self.observed,
-            self._known,
-        )
+        self._predictions: list[CubePrediction] = []
         self.errors = np.zeros((n, len(self.columns), 0))
         self._error_variance = np.zeros((len(self.points), 2))
 
@@ -325,19 +315,14 @@ class SurfaceInverse:
             by_pad: Noise matrices (n, 15, P) as from `compute_noise_by_pad`, with the pads in use.
         """
         self.revision += 1
-        observed = by_pad[:, self.columns]
-        self.by_pad[cubes] = observed * self._unit_factors[:, None]
-        if self._variant_pads is None:
+        self.by_pad[cubes] = by_pad[:, self.columns] * self._unit_factors[:, None]
+        if self._model is None:
             return
         for cube, own in zip(cubes.tolist(), by_pad, strict=True):
-            pads = self._variant_pads[self._whole_variant[cube]]
-            components = pads @ np.nan_to_num(own).T
-            self.variant[cube] = self._cubes.add_variant(components)
-            self._has_other_pads[cube] = not np.array_equal(
-                self.by_pad[cube],
-                self._all_pads[cube],
-                equal_nan=True,
-            )
+            pads = self._model.pads[self._model.variant[cube]]
+            self.variant[cube] = self._cubes.add_variant(pads @ np.nan_to_num(own).T)
+        has_all_pads = np.isclose(self.by_pad, self._all_pads, equal_nan=True).all(axis=(1, 2))
+        self._usable = self.observed & has_all_pads[:, None]
 
     def state_errors(self, errors: Array | None) -> None:
         """Set the errors of the values other than noise, such as those of the compensation.
@@ -351,10 +336,7 @@ class SurfaceInverse:
         """
         if errors is None:
             errors = np.zeros((len(self.observed), len(COMPONENTS), 0))
-        known = self._known[:, :, None]
-        scaled = errors[:, self.columns] * self._unit_factors[:, None]
-        scaled = np.where(known, np.nan_to_num(scaled), 0.0)
-        scaled = scaled[:, :, scaled.any(axis=(0, 1))]
+        scaled = np.nan_to_num(errors[:, self.columns] * self._unit_factors[:, None])
         if scaled.shape == self.errors.shape:
             limit = MIN_ERROR_CHANGE * np.abs(scaled).max(initial=0.0)
             if np.abs(scaled - self.errors).max(initial=0.0) <= limit:
@@ -395,16 +377,13 @@ class SurfaceInverse:
         Returns:
             Traction at all points, as from `field`.
         """
-        # The results are sorted by cube and then by point of its patch, as `points` are.
-        y = self._fill(scaled)
-        result = self._windows.compute_product(y).astype(np.float64)
-        rows = result.reshape(len(self.points), -1)
+        gain = self._windows.matrices.gain
+        rows = self._windows.multiply(gain, self._fill(scaled)).reshape(-1, gain.shape[2])
         return TractionField(rows[:, :3], rows[:, 3])
 
     def compute_depth_pressure_of_scaled(self, scaled: Array) -> Array:
         """Return only `depth_pressure` (M,) of `compute_field_of_scaled`, which is faster."""
-        pressure = self._windows.compute_product(self._fill(scaled), only_pressure=True)
-        return pressure.ravel().astype(float)
+        return self._windows.multiply(self._pressure_gain, self._fill(scaled)).ravel()
 
     def deviation(self, values: Array) -> FieldDeviation:
         """Compute the standard deviations of the traction field that `field` returns.
@@ -431,31 +410,25 @@ class SurfaceInverse:
                 proportional to them.
         """
         y = self._fill(residual)
-        # `variance_with_values` is the variance of each pad's error, divided by the variance of its
-        # noise: 1 for the noise itself, plus the variance that the error of the pad's gain causes.
         known = self._known
-        known_values = np.where(known, scaled, 0.0)
+        # `pad_variance` is the variance of each pad's error, divided by the variance of its noise:
+        # 1 for the noise itself, plus the variance that the error of the pad's gain causes. A cube
+        # without known values contributes no noise to the field.
         to_pads = make_stress_matrices(self.by_pad, known)
-        stresses = to_pads @ known_values[:, :, None]
-        gain_deviation = GAIN_ERROR * stresses[:, :, 0]
-        variance_with_values = gain_deviation**2 + 1
-        # A cube without known values contributes no noise to the field.
-        has_values = known.any(axis=1)
-        pad_variance = np.where(has_values[:, None], variance_with_values, 0)
-        pad_variance = pad_variance.astype(np.float32)
+        stresses = to_pads @ np.where(known, scaled, 0.0)[:, :, None]
+        pad_variance = 1 + (GAIN_ERROR * stresses[:, :, 0]) ** 2
+        pad_variance *= known.any(axis=1, keepdims=True)
 
         windows = self._windows
         scale = windows.compute_scale(y, pad_variance, known)
-        prior = windows.prior[windows.kind] + self._prediction.variance
-        variance = scale[:, None] * prior
-        variance += windows.compute_noise(pad_variance)
-        variance += self._prediction.compute_noise(pad_variance)
-        variance += self._error_variance.reshape(variance.shape)
-        deviation = np.sqrt(variance)
-        on_surface, at_depth = deviation.reshape(-1, 2).T
-        return FieldDeviation(on_surface, at_depth)
+        variance = windows.multiply(windows.matrices.by_pad, pad_variance)
+        variance += scale[:, None, None] * windows.matrices.prior[windows.kind]
+        for prediction in self._predictions:
+            prediction.add_variance(variance, scale, pad_variance)
+        deviation = np.sqrt(variance.reshape(-1, 2) + self._error_variance)
+        return FieldDeviation(*deviation.T)
 
-    def _fill(self, scaled: Array) -> Single:
+    def _fill(self, scaled: Array) -> Array:
         """Replace missing values by predictions from the neighbouring cubes.
 
         Args:
@@ -464,17 +437,17 @@ class SurfaceInverse:
         Returns:
             Values (cubes, C) in Pa without NaN.
         """
-        usable = ~self._has_other_pads[:, None]
-        # The matrices of the prediction depend only on which values are known. This rarely changes
-        # from scan to scan, so they are kept.
-        known = np.isfinite(scaled) & self.observed & usable
+        known = np.isfinite(scaled) & self._usable
+        # The predictions depend only on which values are known, which rarely changes from scan to
+        # scan.
         if not np.array_equal(known, self._known):
             self._known = known
-            self._prediction = MissingValuePrediction(
-                self._windows,
-                self.observed,
-                known,
-            )
+            missing = self.observed & ~known
+            incomplete = np.flatnonzero(missing.any(axis=1)).tolist()
+            self._predictions = [
+                CubePrediction(self._windows, missing, cube) for cube in incomplete
+            ]
         y = np.where(known, scaled, 0.0)
-        single = y.astype(np.float32)
-        return self._prediction.fill(single)
+        for prediction in self._predictions:
+            prediction.fill(y)
+        return y

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Posterior of the traction on the surface, from windows of neighbouring cubes.
 
-K are prior covariances (prior.py) of the traction t (force per area on the surface) and of the
-values y that the cubes measure; N is the covariance of the values' noise. The posterior of the
-traction has the mean t and the covariance::
+The traction t (force per area on the surface) and the values y that the cubes measure have the
+prior covariances K (traction_prior.py); N is the covariance of the errors of the values. The
+posterior of the traction has the mean t and the covariance::
 
     t = G y,   G = K_ty P,   P = (K_yy + N)^-1,   covariance K_tt - G K_yt
 
@@ -14,11 +14,12 @@ cubes) needs only one product. Windows of the same kind (same relative poses and
 matrices.
 
 The standard deviation of the prior adapts to the data: all prior variances are those with the
-pressure `AMPLITUDE`, multiplied by a scale s^2. The noise and the gain errors of the pads cause the
-covariance M of the values (pad_noise.py), which adds diag(G M G') to the variances of the traction.
-With n values, the scale is::
+pressure `AMPLITUDE`, multiplied by a scale s^2. The noise matrix B (pad_noise.py) turns the errors
+of all pads into errors of the values. If each pad's error has the variance v, in units of the
+variance of its noise, the variances of the traction increase by (G B)^2 v, with the squares of all
+entries of G B. With n values, the scale is::
 
-    s^2 = (y' P y - tr P M) / n
+    s^2 = (y' P y - diag(B' P B) v) / n
 
 Source: C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning (2006), 2.2 and
 5.4.
@@ -29,15 +30,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_solve, cholesky
 
-from ..core.arrays import Array, Index, Mask, Real, Single
+from ..core.arrays import Array, Index, Mask, Single
 from ..core.poses import CubePoses
 from ..mechanics.cache import load_or_compute
 from ..mechanics.traction_prior import TractionPrior
 from .nearest_cubes import find_nearest_cubes
-from .prior import AMPLITUDE, compute_covariance_matrix
-from .surface import make_square_points
+from .prior import AMPLITUDE
 from .unrolled_skin import unroll
 
 WINDOW_CUBES = 25
@@ -55,10 +55,6 @@ MODEL_ERROR = 0.01
 in a measured component (stress or gradient), divided by this component's prior standard
 deviation."""
 
-ROWS_PER_POINT = 4
-"""Number of results per surface point: the traction along x, y and z, and the pressure below the
-point at the depth of the cubes' centres."""
-
 _POSE_TOLERANCE = 1e-5
 """Rounding step of the poses of the cubes in a window (nearest cubes from which the traction around
 a cube is computed): in m for positions, without a unit for the sines and cosines of angles.
@@ -68,478 +64,245 @@ follows from the values of the cubes.
 """
 
 
-class ObservationModel(NamedTuple):
-    """Components (stresses and gradients) that n cubes observe, and their noise.
+class _WindowMatrices(NamedTuple):
+    """Matrices of K kinds of windows (cubes nearest to one cube) for the formulas at the file head.
+
+    A window has W cubes with C values and P pads each. The traction is computed at q points around
+    its centre cube. The window's first cubes, I in number, are its inner cubes (`INNER_CUBES`).
 
     Attributes:
-        columns: Indices (C,) in `COMPONENTS` of the components that some cube of the skin observes.
-        known: Whether each cube observes each of these components (n, C).
-        by_pad: Noise matrices (n, C, P) as from `compute_noise_by_pad`: change of each component,
-            in Pa, for one standard deviation of the noise of each pad. Gradients are multiplied by
-            half the side of a cube, so that they are in Pa, too.
-        variant: Index (n,) of each cube's calibration in the measurement model.
+        gain: Matrices G (K, q, 4, W C) from the values of the window's cubes to the four results at
+            each point: the traction along x, y and z, and the pressure at the cubes' depth.
+        prior: Posterior variances (K, q, 2) in Pa^2 of the pressure on the surface and at the
+            cubes' depth, at the scale s = 1 and without errors of the pads.
+        by_pad: Variances (K, q, 2, W P) of these pressures by the noise of each pad, (G B)^2.
+        precision: Matrices P (K, I C, I C) of the values of the inner cubes, in 1/Pa^2.
+        trace: Contributions diag(B' P B) (K, 1, I P) of the pads of the inner cubes to the scale.
     """
 
-    columns: Index
-    known: Mask
-    by_pad: Array
-    variant: Index
-
-    def select(self, cubes: Index) -> ObservationModel:
-        """Return the observation model of some of the cubes.
-
-        Args:
-            cubes: Indices (...) of the cubes. Their axes replace the leading axis n of the arrays.
-        """
-        return ObservationModel(
-            self.columns,
-            self.known[cubes],
-            self.by_pad[cubes],
-            self.variant[cubes],
-        )
+    gain: Single
+    prior: Single
+    by_pad: Single
+    precision: Single
+    trace: Single
 
 
 class WindowPosteriors:
-    """Matrices of the windows of all cubes, for the formulas at the head of this file.
-
-    The window of a cube is the cube and its nearest neighbours, W cubes in total. Windows of the
-    same kind (same relative poses and noise) share their matrices. A cube has C values and, in
-    shapes, P pads; in formulas, P is a matrix.
+    """Windows (the cubes nearest to one cube) of all cubes, and the products with their matrices.
 
     Attributes:
         near: Indices (cubes, W) of the cubes of each window, sorted by their distance from its
             centre cube, which comes first.
-        inner: Number of inner cubes, the first ones of each window, whose values determine the
-            scale s of the prior.
+        inner: Indices (cubes, I) of the inner cubes of each window, the first columns of `near`.
         kind: Index (cubes,) of the kind of each window.
-        gain: Matrix G (kinds, points x ROWS_PER_POINT, W C) from the values of the window's cubes
-            to the results at the points around its centre cube, in single precision.
-        precision: Matrix P (kinds, inner C, inner C) in 1/Pa^2, the inverse covariance of the
-            values of the inner cubes.
-        prior: Posterior variance (kinds, points x 2) in Pa^2 of the pressure on the surface and at
-            the cubes' depth, at the scale s = 1 and without pad noise.
-        by_pad: Variance (kinds, points x 2, W P) in Pa^2 that the noise of each pad causes in the
-            pressure on the surface and in the pressure at the cubes' depth.
-        trace: Contribution (kinds, inner P) of the noise of each pad to the trace of P M, where M
-            is the covariance of the values that the errors of the pads cause.
+        matrices: Matrices of the kinds of windows.
         pads: Noise matrices (cubes, C, P) of all cubes in Pa, 0 where nothing is observed.
     """
 
     def __init__(
         self,
-        traction_prior: TractionPrior,
+        prior: TractionPrior,
         poses: CubePoses,
-        model: ObservationModel,
-        spacing: float,
-        side: int,
+        columns: Index,
+        by_pad: Array,
+        variant: Index,
+        points: Array,
     ) -> None:
         """Compute the matrices, or load them from the cache on disk.
 
         Args:
-            traction_prior: Prior covariances of traction and measured components.
+            prior: Prior covariances of traction and measured components.
             poses: Poses of the cubes.
-            model: Components that the cubes observe, and their noise.
-            spacing: Distance of the points on the patch of a cube, in m.
-            side: Number of points along a side of the patch.
+            columns: Indices (C,) in `COMPONENTS` of the components that the cubes measure.
+            by_pad: Noise matrices (cubes, C, P) as from `compute_noise_by_pad`, with gradients in
+                Pa: they are multiplied by half the side of a cube.
+            variant: Index (cubes,) of each cube's calibration in the measurement model.
+            points: Positions (q, 2) of the points on the patch of a cube in its x-y plane, in m.
         """
         self.near = find_nearest_cubes(poses, WINDOW_CUBES, by_position=True)
-        self.inner = min(INNER_CUBES, self.near.shape[1])
-        self.pads = np.nan_to_num(model.by_pad)
-        n = len(self.near)
-        place, angle = unroll(poses, np.arange(n), self.near)
-        self.kind = self._find_kinds(model, place, angle)
+        self.inner = self.near[:, :INNER_CUBES]
+        self.pads = np.nan_to_num(by_pad)
+        place, angle = unroll(poses, np.arange(len(self.near)), self.near)
+        first = self._find_kinds(by_pad, variant, place, angle)
 
         # The matrices are computed for the first window of each kind, and serve for all of them.
-        kinds, first = np.unique(self.kind, return_index=True)
-        example = model.select(self.near[first])
-        inputs: list[object] = [
-            *traction_prior.inputs,
-            spacing,
-            side,
-            place[first],
-            angle[first],
-        ]
-        inputs += [example.columns, example.by_pad, example.variant]
-        points = make_square_points(spacing, side)
+        cubes = self.near[first]
+        windows = (place[first], angle[first], by_pad[cubes], variant[cubes])
 
-        def solve_kinds() -> dict[str, Real]:
-            """Compute the arrays of `_Window` for all kinds of windows.
-
-            Returns:
-                Arrays by their names in `_Window`, each with the kinds as an additional first axis.
-            """
-            solved: dict[str, Real] = {}
+        def solve_kinds() -> dict[str, Single]:
+            solved: dict[str, Single] = {}
             # The matrices of a kind are copied into the result as soon as they are computed,
             # because a list of all of them would double the memory.
-            for number, one in enumerate(first):
-                own = model.select(self.near[one])
-                window = _solve_window(
-                    traction_prior,
-                    own,
-                    place[one],
-                    angle[one],
-                    points,
-                )
-                for name, array in window._asdict().items():
-                    if name not in solved:
-                        shape = (len(first), *array.shape)
-                        solved[name] = np.empty(shape, array.dtype)
+            for number, window in enumerate(zip(*windows, strict=True)):
+                for name, array in _solve_window(prior, columns, points, *window).items():
+                    if not number:
+                        solved[name] = np.empty((len(first), *array.shape), np.float32)
                     solved[name][number] = array
             return solved
 
-        solved = load_or_compute("windows", inputs, solve_kinds)
-        self.gain = solved["gain"]
-        self.precision = solved["precision"]
-        self.prior = solved["variance"]
-        self.by_pad = solved["by_pad"]
-        self.trace = solved["trace"]
-
-        # In `compute_product`, all windows that are the only ones of their kind are multiplied in
-        # one batch, the others one kind at a time.
-        self._rows = []
-        for kind in kinds:
-            rows = np.flatnonzero(self.kind == kind)
-            self._rows.append((kind, rows))
-        self._shared_kinds = [(kind, rows) for kind, rows in self._rows if len(rows) > 1]
-        counts = np.bincount(self.kind)
-        is_single = counts[self.kind] == 1
-        self._single = np.flatnonzero(is_single)
-        single_kinds = self.kind[self._single]
-        by_point = self.gain.reshape(
-            len(self.gain),
-            len(points),
-            ROWS_PER_POINT,
-            -1,
-        )
-        pressure_gain = np.ascontiguousarray(by_point[:, :, -1])
-        self._gains = [(gain, gain[single_kinds]) for gain in (self.gain, pressure_gain)]
+        inputs = [*prior.inputs, columns, points, *windows]
+        self.matrices = _WindowMatrices(**load_or_compute("windows", inputs, solve_kinds))
 
     def _find_kinds(
         self,
-        model: ObservationModel,
+        by_pad: Array,
+        variant: Index,
         place: Array,
         angle: Array,
     ) -> Index:
-        """Find windows (cubes nearest to one cube) of the same kind, which share their matrices.
-
-        The cubes of such windows have the same relative poses, noise and calibrations.
+        """Find windows of the same kind: same relative poses, noise and calibrations.
 
         Args:
-            model: Components that all cubes observe, and their noise.
+            by_pad: Noise matrices (cubes, C, P).
+            variant: Index (cubes,) of each cube's calibration in the measurement model.
             place: Positions (cubes, W, 2) of the cubes of each window, in m.
             angle: Rotations (cubes, W) of these cubes, in rad.
 
         Returns:
-            Number (cubes,) of the kind of each window.
+            Index (kinds,) of the first window of each kind.
         """
         n = len(place)
         # The noise of components that are not observed is NaN, which is not equal to itself. It is
         # replaced by -1 and not by 0, the noise of components without noise.
-        noise = np.nan_to_num(model.by_pad, nan=-1.0)
-        noise_kind = _number_distinct(noise.reshape(n, -1))
-        poses = np.concatenate(
-            [
-                place.reshape(n, -1),
-                np.cos(angle),
-                np.sin(angle),
-            ],
-            axis=1,
+        noise = np.nan_to_num(by_pad, nan=-1.0).reshape(n, -1)
+        _, noise_kind = np.unique(noise, axis=0, return_inverse=True)
+        poses = [place.reshape(n, -1), np.cos(angle), np.sin(angle)]
+        rounded = [np.round(one / _POSE_TOLERANCE) for one in poses]
+        numbers = [noise_kind.reshape(n)[self.near], variant[self.near]]
+        _, first, kind, count = np.unique(
+            np.concatenate([*rounded, *numbers], axis=1),
+            axis=0,
+            return_index=True,
+            return_inverse=True,
+            return_counts=True,
         )
-        rounded = np.round(poses / _POSE_TOLERANCE)
-        features = [
-            rounded,
-            noise_kind[self.near],
-            model.variant[self.near],
-        ]
-        return _number_distinct(np.concatenate(features, axis=1))
 
-    def compute_product(self, y: Single, only_pressure: bool = False) -> Single:
-        """Compute the posterior mean G y (head of this file) of the traction around all cubes.
+        # Kinds with only one window come first, so that `multiply` can multiply all of them in one
+        # batch. The other kinds are multiplied one by one.
+        order = np.argsort(count > 1, kind="stable")
+        self.kind = np.argsort(order)[kind.reshape(n)]
+        first = first[order]
+        n_single = np.count_nonzero(count == 1)
+        self._single = first[:n_single]
+        kinds = range(n_single, len(first))
+        self._shared = [(number, np.flatnonzero(self.kind == number)) for number in kinds]
+        return first
+
+    def multiply(self, matrices: Single, values: Array) -> Array:
+        """Multiply the values of the cubes of every window by the matrix of the window's kind.
 
         Args:
-            y: Components (cubes, C) that the cubes measure, in Pa; 0 where unknown.
-            only_pressure: Whether only the pressure at the cubes' depth is computed, which takes a
-                third of the time.
+            matrices: Matrices (K, ..., w k) of all kinds, for k values of the first w cubes of a
+                window.
+            values: Values (cubes, k).
 
         Returns:
-            Posterior mean (cubes, points x ROWS_PER_POINT) in Pa, at the surface points around each
-            cube. Each point has `ROWS_PER_POINT` results: traction along x, y and z, and pressure
-            at the cubes' depth. If `only_pressure`, only the latter (cubes, points).
+            Products (cubes, ...), computed in single precision.
         """
-        # The values of all cubes of a window are joined to one row, in the order of the columns of
-        # the gain matrix G.
-        n = len(self.near)
-        gathered = y.take(self.near, axis=0).reshape(n, -1)
-        gains, single_gains = self._gains[only_pressure]
-        result = np.empty((n, gains.shape[1]), np.float32)
-        for kind, rows in self._shared_kinds:
-            result[rows] = gathered[rows] @ gains[kind].T
-        if len(self._single):
-            single = gathered[self._single]
-            products = single_gains @ single[:, :, None]
-            result[self._single] = products[:, :, 0]
-        return result
+        *shape, width = matrices.shape
+        matrices = matrices.reshape(len(matrices), -1, width)
+        near = self.near[:, : width // values.shape[1]]
+        gathered = values.astype(np.float32).take(near, axis=0).reshape(len(near), -1)
+        result = np.empty((len(near), matrices.shape[1]))
+        for kind, windows in self._shared:
+            result[windows] = gathered[windows] @ matrices[kind].T
+        single = gathered[self._single, :, None]
+        products = matrices[: len(single)] @ single
+        result[self._single] = products[:, :, 0]
+        return result.reshape(len(near), *shape[1:])
 
-    def compute_scale(
-        self,
-        y: Single,
-        pad_variance: Single,
-        known: Mask,
-    ) -> Array:
+    def compute_scale(self, y: Array, pad_variance: Array, known: Mask) -> Array:
         """Compute the factor s^2 of the prior variances in each window from its inner cubes.
 
         Args:
             y: Values (cubes, C) in Pa.
-            pad_variance: Variance (cubes, P) of the error of each pad, divided by the variance of
-                its noise.
+            pad_variance: Variances v (cubes, P) of the errors of the pads, divided by the variance
+                of their noise.
             known: Whether each value is known (cubes, C).
 
         Returns:
             Factors s^2 (cubes,); 1 in windows without a known value.
         """
-        inner = self.near[:, : self.inner]
-        n = len(inner)
-        gathered = y[inner].reshape(n, -1)
-        pads = pad_variance[inner].reshape(n, -1)
-
-        # `excess` is y' P y - tr P M: the squared values, weighted with their inverse covariance P,
-        # minus the part that the errors of the pads are expected to cause.
-        excess = np.empty(n)
-        for kind, rows in self._rows:
-            own = gathered[rows]
-            weighted = own @ self.precision[kind]
-            excess[rows] = (weighted * own).sum(axis=1)
-            excess[rows] -= pads[rows] @ self.trace[kind]
-        excess = np.maximum(excess, 0)
-        count_by_cube = known.sum(axis=1)
-        count = count_by_cube[inner].sum(axis=1)
-        mean_excess = excess / np.maximum(count, 1)
-        return np.where(count > 0, mean_excess, 1.0)
-
-    def compute_noise(self, pad_variance: Single) -> Array:
-        """Compute the variances of the pressures that the errors of the pads cause.
-
-        Args:
-            pad_variance: Variance (cubes, P) of the error of each pad, divided by the variance of
-                its noise.
-
-        Returns:
-            Variances (cubes, points x 2) in Pa^2 of the pressure on the surface and of the pressure
-            at the cubes' depth.
-        """
-        n = len(self.near)
-        gathered = pad_variance[self.near].reshape(n, -1)
-        n_pressures = self.by_pad.shape[1]
-        noise = np.empty((n, n_pressures))
-        for kind, rows in self._rows:
-            by_pad = self.by_pad[kind]
-            noise[rows] = gathered[rows] @ by_pad.T
-        return noise
-
-
-class _Window(NamedTuple):
-    """Matrices for the traction around a cube from the values of its window (the nearest cubes).
-
-    All windows of one kind (same relative poses and noise) use them. `WindowPosteriors` describes
-    them; its attribute `prior` holds each `variance`.
-    """
-
-    gain: Single
-    precision: Single
-    variance: Array
-    by_pad: Single
-    trace: Single
+        weighted = self.multiply(self.matrices.precision, y)
+        square = (weighted * y[self.inner].reshape(weighted.shape)).sum(axis=1)
+        excess = square - self.multiply(self.matrices.trace, pad_variance)[:, 0]
+        count = known.sum(axis=1)[self.inner].sum(axis=1)
+        return np.where(count > 0, np.maximum(excess, 0) / np.maximum(count, 1), 1.0)
 
 
 def _solve_window(
-    traction_prior: TractionPrior,
-    model: ObservationModel,
+    prior: TractionPrior,
+    columns: Index,
+    points: Array,
     place: Array,
     angle: Array,
-    points: Array,
-) -> _Window:
+    by_pad: Array,
+    variant: Index,
+) -> dict[str, Single]:
     """Compute the matrices of one window, for the traction around its centre cube.
 
-    The traction follows from the values of the W cubes of the window. Positions and rotations are
-    in the frame of the centre cube, around which the skin is laid flat.
+    Positions and rotations are in the frame of the centre cube, around which the skin is laid flat.
 
     Args:
-        traction_prior: Prior covariances of traction and measured components.
-        model: Components that the W cubes of the window observe, and their noise.
+        prior: Prior covariances of traction and measured components.
+        columns: Indices (C,) in `COMPONENTS` of the components that the cubes measure.
+        points: Positions (q, 2) on the surface around the centre cube, in m.
         place: Positions (W, 2) of the cubes in m.
         angle: Rotations (W,) of the cubes in rad.
-        points: Positions (points, 2) on the surface around the centre cube, in m.
-    """
-    columns = model.columns
-    n = len(place)
-    width = len(columns)
-    known = model.known.ravel()
-    pads = np.nan_to_num(model.by_pad)
-
-    unit_prior = compute_covariance_matrix(
-        traction_prior,
-        columns,
-        place,
-        angle,
-        model.variant,
-    )
-    prior = AMPLITUDE**2 * unit_prior
-    total = prior.copy()  # becomes the covariance K_yy + N of the measured values
-    for cube, own in enumerate(pads):
-        first = cube * width
-        part = slice(first, first + width)
-        total[part, part] += own @ own.T
-    model_variance = MODEL_ERROR**2 * np.diag(prior)
-    total[np.diag_indices(n * width)] += model_variance
-
-    # `known_gain` is the gain matrix G = K_ty (K_yy + N)^-1 for the known values, and `variance`
-    # the posterior variance diag(K_tt - G K_yt) of the traction.
-    cross = _compute_cross_covariance(
-        traction_prior,
-        model,
-        place,
-        angle,
-        points,
-    )
-    cross = cross[:, known]
-    known_block = np.ix_(known, known)
-    # Cholesky takes a quarter of the time of numpy's general solver.
-    factor = cho_factor(total[known_block])
-    known_gain = cho_solve(factor, cross.T).T
-    per_point = np.array([*traction_prior.variance, traction_prior.pressure_variance])
-    prior_variance = AMPLITUDE**2 * np.tile(per_point, len(points))
-    explained = (known_gain * cross).sum(axis=1)
-    variance = prior_variance - explained
-    n_results = len(cross)
-    gain = np.zeros((n_results, n * width), np.float32)
-    gain[:, known] = known_gain
-
-    # With the noise matrix B of the pads, diag(G M G') is a sum of (G B)^2 over the pads.
-    by_point = gain.reshape(-1, ROWS_PER_POINT, n, width)
-    pressure_gain = by_point[:, 2:].reshape(-1, n, width)
-    by_pad = np.einsum("rwc,wcp->rwp", pressure_gain, pads, optimize=True)
-    by_pad = by_pad.reshape(len(pressure_gain), -1) ** 2
-
-    inner = min(INNER_CUBES, n)
-    size = inner * width
-    precision = _invert_known(total[:size, :size], known[:size])
-    cubes = np.arange(inner)
-    # The noise covariance M has no entries between different cubes, so the trace of P M depends
-    # only on the diagonal blocks of P.
-    blocks = precision.reshape(inner, width, inner, width)
-    diagonal = blocks[cubes, :, cubes]
-    inner_pads = pads[:inner]
-    trace = np.einsum(
-        "wcp,wcd,wdp->wp",
-        inner_pads,
-        diagonal,
-        inner_pads,
-        optimize=True,
-    )
-    pressure_variance = select_pressure(variance)
-    return _Window(
-        gain=gain,
-        precision=precision.astype(np.float32),
-        variance=np.maximum(pressure_variance, 0),
-        by_pad=by_pad.astype(np.float32),
-        trace=trace.ravel().astype(np.float32),
-    )
-
-
-def _compute_cross_covariance(
-    traction_prior: TractionPrior,
-    model: ObservationModel,
-    place: Array,
-    angle: Array,
-    points: Array,
-) -> Array:
-    """Compute the prior covariance K_ty of the traction at surface points with the cubes' values.
-
-    At each point, the traction along x, y and z is followed by the pressure below the point at the
-    depth of the cubes' centres. Each cube has C values, the observed components. Positions and
-    rotations are in the frame of the centre cube, around which the skin is laid flat.
-
-    Args:
-        traction_prior: Prior covariances of traction and measured components.
-        model: Components that the W cubes of the window observe.
-        place: Positions (W, 2) of the cubes in m.
-        angle: Rotations (W,) of the cubes in rad.
-        points: Positions (points, 2) on the patch of the centre cube, in m.
+        by_pad: Noise matrices (W, C, P) in Pa; NaN for components that a cube does not observe.
+        variant: Index (W,) of each cube's calibration in the measurement model.
 
     Returns:
-        Covariance (points x ROWS_PER_POINT, W C) in Pa^2.
+        Arrays of `_WindowMatrices` by name, without their first axis.
     """
-    columns = model.columns
-    n = len(place)
-    n_points = len(points)
-    width = len(columns)
+    n, width, _ = by_pad.shape
+    size = n * width
+    observed = np.isfinite(by_pad.sum(axis=2)).ravel()
+    pads = np.nan_to_num(by_pad)
+
+    # `covariance` becomes K_yy + N. Only its upper triangle is set and used. Components that are
+    # not observed get the variance 1 and no covariance with others, so that they have no effect.
+    first, second = np.triu_indices(n)
+    pairs = prior.compute_covariance(
+        place[first] - place[second],
+        angle[first],
+        variant[first],
+        angle[second],
+        variant[second],
+    )
+    by_cubes = np.zeros((n, n, width, width))
+    by_cubes[first, second] = pairs[:, columns[:, None], columns]
+    covariance = AMPLITUDE**2 * by_cubes.swapaxes(1, 2).reshape(size, size)
+    covariance[np.diag_indices(size)] *= 1 + MODEL_ERROR**2
+    covariance += block_diag(*(pads @ pads.swapaxes(1, 2)))
+    covariance = np.where(np.outer(observed, observed), covariance, np.eye(size))
+    factor = cholesky(covariance)
+
+    # `cross` is K_ty. Its axes are first the cubes, points, components and results.
     offset = place[:, None] - points
-    offset = offset.reshape(-1, 2)
-    angles = np.repeat(angle, n_points)
-    variants = np.repeat(model.variant, n_points)
-
-    traction = traction_prior.compute_traction_covariance(
-        offset,
-        angles,
-        variants,
+    cross = prior.compute_surface_covariance(
+        offset.reshape(-1, 2),
+        np.repeat(angle, len(points)),
+        np.repeat(variant, len(points)),
     )
-    traction = traction[:, columns].reshape(n, n_points, width, 3)
-    pressure = traction_prior.compute_pressure_covariance(
-        offset,
-        angles,
-        variants,
-    )
-    pressure = pressure[:, columns].reshape(n, n_points, width)
-    cross = np.empty((n_points, ROWS_PER_POINT, n, width))
-    # The axes of `cross` are the points, their results, the cubes and the components.
-    cross[:, :3] = traction.transpose(1, 3, 0, 2)
-    cross[:, 3] = pressure.transpose(1, 0, 2)
-    return AMPLITUDE**2 * cross.reshape(-1, n * width)
+    cross = cross[:, columns].reshape(n, len(points), width, -1)
+    cross = cross.transpose(1, 3, 0, 2).reshape(len(points), -1, size)
+    cross = AMPLITUDE**2 * np.where(observed, cross, 0.0)
+    gain = cho_solve((factor, False), cross.reshape(-1, size).T).T.reshape(cross.shape)
+    variance = AMPLITUDE**2 * prior.variance - (gain * cross).sum(axis=2)
 
-
-def _invert_known(matrix: Array, known: Mask) -> Array:
-    """Invert the part of a covariance matrix that belongs to known values.
-
-    Args:
-        matrix: Covariance (D, D) of all values.
-        known: Whether each value (D,) is known.
-
-    Returns:
-        Inverse (D, D), in which the rows and columns of unknown values are 0.
-    """
-    inverse = np.zeros_like(matrix)
-    block = np.ix_(known, known)
-    factor = cho_factor(matrix[block])
-    identity = np.eye(known.sum())
-    inverse[block] = cho_solve(factor, identity)
-    return inverse
-
-
-def select_pressure(rows: Array) -> Array:
-    """Select the pressures from results that also contain the shear traction.
-
-    Args:
-        rows: Results (..., points x ROWS_PER_POINT). Each point has the traction along x, y and z
-            and the pressure at the cubes' depth.
-
-    Returns:
-        Results (..., points x 2): for each point the traction along z, whose negative is the
-        pressure on the surface, and the pressure at the cubes' depth.
-    """
-    leading = rows.shape[:-1]
-    by_point = rows.reshape(*leading, -1, ROWS_PER_POINT)
-    chosen = by_point[..., 2:]
-    return chosen.reshape(*leading, -1)
-
-
-def _number_distinct(rows: Array) -> Index:
-    """Number the distinct rows of a matrix.
-
-    Args:
-        rows: Matrix (n, k).
-
-    Returns:
-        Number (n,) of each row, from 0 on; equal rows have the same number.
-    """
-    _, number = np.unique(rows, axis=0, return_inverse=True)
-    return np.asarray(number).reshape(-1)
+    by_cube = gain[:, 2:].reshape(len(points), 2, n, 1, width)
+    effect = by_cube @ pads  # G B; the noise matrix B has one block for each cube
+    inner = pads[:INNER_CUBES]
+    size = len(inner) * width
+    precision = cho_solve((factor[:size, :size], False), np.eye(size))
+    noise = block_diag(*inner)
+    trace = np.einsum("dp,dp->p", precision @ noise, noise)
+    arrays = {
+        "gain": gain,
+        "prior": np.maximum(variance[:, 2:], 0),
+        "by_pad": effect.reshape(len(points), 2, -1) ** 2,
+        "precision": precision,
+        "trace": trace[None],
+    }
+    return {name: array.astype(np.float32) for name, array in arrays.items()}
