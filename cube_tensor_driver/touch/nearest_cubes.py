@@ -33,14 +33,12 @@ def find_nearest_cubes(
         square = np.einsum("ni,ni->n", offset, offset)
         # Candidates are all cubes that are at most about as far away as the last of the W cubes.
         limit = 1.01 * np.partition(square, count - 1)[count - 1]
-        (candidates,) = np.nonzero(square <= limit)
-        local = offset[candidates] @ rotation
+        candidates = np.flatnonzero(square <= limit)
         # Positions are rounded, because otherwise rounding errors would decide the order of equally
         # distant cubes.
-        local = np.round(local / pitch, 4)
+        local = np.round(offset[candidates] @ rotation / pitch, 4)
         distance = np.linalg.norm(local, axis=1).round(4)
         x, y, _ = local.T
-        ties = (y, x) if by_position else (candidates,)
-        order = np.lexsort((*ties, distance))
-        near.append(candidates[order[:count]])
+        keys = (y, x, distance) if by_position else (distance,)
+        near.append(candidates[np.lexsort(keys)[:count]])
     return np.array(near)

@@ -33,11 +33,11 @@ import numpy as np
 from ..core.arrays import Array
 from ..core.calibration import Calibration
 from ..core.errors import ElasticError
-from ..core.pipeline import Pipeline
 from ..mechanics.cache import load_or_compute
 from ..mechanics.influence import Influence
 from ..mechanics.measurement_model import MeasurementModel
-from ..mechanics.spectra import BesselTable, Spectra, make_wavenumber_quadrature, tabulate_bessel
+from ..mechanics.spectra import Spectra, make_wavenumber_quadrature, tabulate_bessel
+from .pad_noise import compute_noise_of_all_pads
 
 N_DIRECTIONS = 32
 """Number of equally spaced directions from the force to the cube at which the influence functions
@@ -62,11 +62,6 @@ components, which a rotation about the normal of the skin multiplies by a phase.
 _N_DISTANCES = 400
 """Number of Gauss points in r, the distance between force and cube. They resolve the oscillations
 of the Bessel functions up to the largest distance (half the width of the finite element body)."""
-
-_PADS = "pads"
-"""Name, in the cached file, of the matrix from circular components to the stresses of the pads. A
-rotation about the normal of the skin multiplies a circular component by a phase. The other arrays
-of the file are the attributes of `Spectra`."""
 
 _MATCH_TOLERANCE = 1e-6
 """Largest difference up to which the cube and pads of a calibration count as those of the influence
@@ -95,22 +90,15 @@ def model_pads(
     variant_numbers = {id(one): number for number, one in enumerate(variants)}
     spectra, all_pads = _load_decomposition(influence)
 
-    pipeline = Pipeline(variants)
-    components = []
-    shape = len(variants), len(all_pads), pipeline.n_pads
-    pads = np.zeros(shape)
-    for number, calibration in enumerate(variants):
-        matches = _match_pads(influence, calibration)
-        own = all_pads[:, matches]
-        matrix = np.nan_to_num(pipeline.find_matrix(number))
-        components.append(own @ matrix.T)  # circular components -> pads -> measured components
-        pads[number, :, : own.shape[1]] = own / calibration.noise
-
-    variant = np.array(
-        [variant_numbers[id(one)] for one in calibrations],
-        np.intp,
-    )
-    return MeasurementModel(spectra, np.stack(components), variant, pads)
+    by_pad = compute_noise_of_all_pads(variants)
+    pads = np.zeros((len(variants), len(all_pads), by_pad.shape[2]))
+    for own, calibration in zip(pads, variants, strict=True):
+        matched = all_pads[:, _match_pads(influence, calibration)]
+        own[:, : matched.shape[1]] = matched / calibration.noise
+    # Circular components yield the stresses of the pads, and these the measured components.
+    components = pads @ np.nan_to_num(by_pad).swapaxes(1, 2)
+    variant = np.array([variant_numbers[id(one)] for one in calibrations], np.intp)
+    return MeasurementModel(spectra, components, variant, pads)
 
 
 def _match_pads(influence: Influence, calibration: Calibration) -> list[int]:
@@ -132,136 +120,80 @@ def _match_pads(influence: Influence, calibration: Calibration) -> list[int]:
             f"./cube fem MODEL --load surface, with side: {side:g} in the model"
         )
 
-    same_size = abs(given.pad_size - layout.pad_size) <= _MATCH_TOLERANCE
-    matches = []
-    for name, position, normal in zip(
-        layout.pads,
-        layout.positions,
-        layout.normals,
-        strict=True,
-    ):
-        shift = np.abs(given.positions - position)
-        turn = np.abs(given.normals - normal)
-        difference = shift.max(axis=1)
-        difference += turn.max(axis=1)
-        nearest = int(np.argmin(difference))
-        if difference[nearest] > _MATCH_TOLERANCE or not same_size:
-            raise ElasticError(
-                f"the influence functions have no pad like {name} of layout {layout.name!r}; make "
-                "them again with ./cube fem MODEL --load surface for this layout"
-            )
-        matches.append(nearest)
-    return matches
+    own, theirs = (np.hstack([one.positions, one.normals]) for one in (layout, given))
+    difference = np.abs(own[:, None] - theirs).max(axis=2)
+    difference += abs(given.pad_size - layout.pad_size)
+    unmatched = np.flatnonzero(difference.min(axis=1) > _MATCH_TOLERANCE)
+    if len(unmatched):
+        raise ElasticError(
+            f"the influence functions have no pad like {layout.pads[unmatched[0]]} of layout "
+            f"{layout.name!r}; make them again with ./cube fem MODEL --load surface for this layout"
+        )
+    return [int(row.argmin()) for row in difference]
 
 
 def _load_decomposition(influence: Influence) -> tuple[Spectra, Array]:
-    """Return the result of `_decompose`, from the cache if it is there."""
+    """Return the result of `_decompose`, from the cache if it is there.
 
-    def compute() -> dict[str, Array]:
-        spectra, pads = _decompose(influence)
-        return {**vars(spectra), _PADS: pads}
-
+    Returns:
+        Spectra (Hankel transforms) of n circular components, and the matrix (2 n, P) from the real
+        parts and then the imaginary parts of the components to the stresses of P pads.
+    """
     inputs = [influence.depth, influence.place, influence.pads]
-    arrays = load_or_compute("pads", inputs, compute)
-    pads = arrays.pop(_PADS)
+    arrays = load_or_compute("pads", inputs, lambda: _decompose(influence))
+    pads = arrays.pop("pads")
     order = arrays.pop("order").astype(np.int64)
     return Spectra(order=order, **arrays), pads
 
 
-def _decompose(influence: Influence) -> tuple[Spectra, Array]:
-    """Decompose the influence functions into n circular components.
-
-    Returns:
-        Spectra (Hankel transforms) of the components, and the matrix (2 n, P) from the real parts
-        and then the imaginary parts of the components to the stresses of P pads.
-    """
-    abscissae, weights = np.polynomial.legendre.leggauss(_N_DISTANCES)
-    half_reach = influence.reach / 2
-    r = (abscissae + 1) * half_reach
-    weight = weights * half_reach
-
-    # The functions of the distance r are weighted with sqrt(r dr). The square of a singular value
-    # is then an integral over the plane in which the force is moved.
-    root = np.sqrt(r * weight)
-    decompositions = [
-        np.linalg.svd(
-            (series * root).reshape(len(series), -1),
-            full_matrices=False,
-        )
-        for series in _compute_fourier_series(influence, r)
-    ]
-    largest = max(values[0] for _, values, _ in decompositions)
-
-    k, wave_weight = make_wavenumber_quadrature(influence.depth)
-    bessel = tabulate_bessel(k, r)
-    orders: list[int] = []
-    spectra = []
-    pads = []
-    for order, (left, values, right) in enumerate(decompositions):
-        is_kept = values > MIN_SINGULAR_VALUE * largest
-        n_kept = int(is_kept.sum())
-        weighted_functions = right[is_kept].reshape(n_kept, 3, -1)
-        functions = weighted_functions / root
-        orders += [order] * n_kept
-        transforms = _compute_hankel_transforms(
-            functions,
-            order,
-            bessel,
-            r * weight,
-        )
-        spectra.append(transforms)
-        weighted = left[:, is_kept] * values[is_kept]
-        pads.append(weighted.reshape(2, -1, n_kept))
-
-    by_kind = zip(*spectra, strict=True)
-    plus, minus, normal = (np.concatenate(parts, axis=1) for parts in by_kind)
-    to_pads = np.concatenate(pads, axis=2).swapaxes(1, 2)  # (2: real and imaginary, n, P)
-    to_pads = to_pads.reshape(2 * len(orders), -1)
-    return Spectra(
-        k,
-        wave_weight,
-        np.array(orders),
-        plus,
-        minus,
-        normal,
-    ), to_pads
-
-
-def _compute_hankel_transforms(
-    functions: Array,
-    order: int,
-    bessel: BesselTable,
-    weight: Array,
-) -> tuple[Array, Array, Array]:
-    """Compute the spectra P, M and N (file head) of n circular components of one order m.
+def _decompose(influence: Influence) -> dict[str, Array]:
+    """Decompose the influence functions into circular components.
 
     A circular component is a combination of the pads' stresses that a rotation about the normal of
     the skin only multiplies by a phase.
 
-    Args:
-        functions: Radial functions R, Z and T (n, 3, distances): response to a radial, normal and
-            tangential force (circular.py).
-        order: Order m.
-        bessel: Function that returns the Bessel function J_m(k r) (distances, waves) of an order.
-        weight: Quadrature weights r dr (distances,) in m^2.
-
     Returns:
-        Spectra P, M and N (waves, n), the Hankel transforms of R + T, R - T and Z, at the wave
-        numbers of `bessel`.
+        Attributes of the `Spectra` of the components by name, and as "pads" the matrix from the
+        components to the stresses of the pads; see `_load_decomposition`.
     """
+    abscissae, weights = np.polynomial.legendre.leggauss(_N_DISTANCES)
+    half_reach = influence.reach / 2
+    r = (abscissae + 1) * half_reach
+    area = r * weights * half_reach  # r dr
+
+    # The functions of the distance r are weighted with sqrt(r dr). The square of a singular value
+    # is then an integral over the plane in which the force is moved.
+    root = np.sqrt(area)
+    series = _compute_fourier_series(influence, r) * root
+    flat = series.reshape(*series.shape[:2], -1)
+    left, values, right = np.linalg.svd(flat, full_matrices=False)
+    order, number = np.nonzero(values > MIN_SINGULAR_VALUE * values.max())
+    n = len(order)
+    functions = right[order, number].reshape(n, 3, -1) / root
+    pads = left[order, :, number] * values[order, number, None]
+    # The first half of the columns belongs to the real parts, the second to the imaginary parts.
+    pads = pads.reshape(n, 2, -1).swapaxes(0, 1).reshape(2 * n, -1)
+
+    k, weight = make_wavenumber_quadrature(influence.depth)
+    bessel = tabulate_bessel(k, r)
+
+    def transform(parts: Array, shift: int) -> Array:
+        pairs = zip(parts * area, order.tolist(), strict=True)
+        return 2 * np.pi * np.stack([part @ bessel(m + shift) for part, m in pairs], axis=1)
+
     along, normal, across = np.moveaxis(functions, 1, 0)
+    spectra = Spectra(
+        k,
+        weight,
+        order.astype(np.int64),
+        transform(along + across, -1),
+        transform(along - across, 1),
+        transform(normal, 0),
+    )
+    return {**vars(spectra), "pads": pads}
 
-    def transform(function: Array, shift: int) -> Array:
-        waves = bessel(order + shift).T
-        weighted = function * weight
-        return np.asarray(2 * np.pi * waves @ weighted.T)
 
-    plus = transform(along + across, -1)
-    minus = transform(along - across, 1)
-    return plus, minus, transform(normal, 0)
-
-
-def _compute_fourier_series(influence: Influence, r: Array) -> list[Array]:
+def _compute_fourier_series(influence: Influence, r: Array) -> Array:
     """Compute the Fourier series of the influence functions over the direction from force to cube.
 
     The influence function of a pad is its stress under a force of 1 N, as a function of the force's
@@ -276,39 +208,22 @@ def _compute_fourier_series(influence: Influence, r: Array) -> list[Array]:
         r: Distances (distances,) between force and cube, in m.
 
     Returns:
-        For each order m, the functions R, Z and T (2 P, 3, distances): first those of the component
-        c of each of the P pads, then those of the component c' of each pad.
+        Functions R, Z and T of each order m (`N_ORDERS`, 2 P, 3, distances): first those of the
+        component c of each of the P pads, then those of the component c' of each pad.
     """
-    angle = 2 * np.pi * np.arange(N_DIRECTIONS) / N_DIRECTIONS
-    cosine = np.cos(angle)
-    sine = np.sin(angle)
-    direction = np.stack([cosine, sine], axis=1)
+    # Vectors in the plane are complex numbers x + i y.
+    direction = np.exp(2j * np.pi * np.arange(N_DIRECTIONS) / N_DIRECTIONS)
     # The direction runs from the force to the cube, so the force lies at minus r.
-    place = -r[:, None, None] * direction
-    responses = influence.interpolate(place.reshape(-1, 2))
+    place = -np.outer(r, direction).ravel()
+    responses = influence.interpolate(np.stack([place.real, place.imag], axis=1))
     responses = responses.reshape(-1, len(r), N_DIRECTIONS, 3)
-
     x, y, z = np.moveaxis(responses, -1, 0)
-    radial = cosine * x + sine * y
-    tangential = cosine * y - sine * x
-    polar = np.stack([radial, z, tangential], axis=1)
-    coefficients = np.fft.fft(polar, axis=-1) / N_DIRECTIONS
+    rotated = (x + 1j * y) / direction  # radial + i tangential
+    polar = np.stack([rotated.real, z, rotated.imag], axis=1)
 
-    series = []
-    for order in range(N_ORDERS):
-        # The terms exp(i m phi) and exp(-i m phi) of a real function are complex conjugates. Both
-        # contribute to order m, hence the factor 2; at order 0 they are the same term.
-        factor = 1.0 if order == 0 else 2.0
-        even = factor * coefficients[..., order].real
-        odd = -factor * coefficients[..., order].imag
-        real = np.stack(
-            [
-                even[:, 0],
-                even[:, 1],
-                -odd[:, 2],
-            ],
-            axis=1,
-        )
-        imaginary = np.stack([odd[:, 0], odd[:, 1], even[:, 2]], axis=1)
-        series.append(np.concatenate([real, imaginary]))
-    return series
+    # The terms exp(i m phi) and exp(-i m phi) of a real function are complex conjugates. Both
+    # contribute to order m, hence the factor 2; at order 0 they are the same term.
+    terms = np.fft.ifft(polar)[..., :N_ORDERS]
+    terms[..., 1:] *= 2
+    terms[:, 2] *= 1j
+    return np.moveaxis(np.concatenate([terms.real, terms.imag]), -1, 0)

@@ -30,25 +30,17 @@ def unroll(
         Positions (n, W, 2) in m and rotations (n, W) about z in rad of the neighbours, each in the
         frame of its centre cube, with the origin in the centre of this cube.
     """
-    to_centre = poses.rotation[centres]
-    origin = poses.position[centres]
-    positions = poses.position[near]
-    offset = positions - origin[:, None]
-    local = np.einsum("nji,nkj->nki", to_centre, offset)
-
+    rotation = poses.rotation[centres]
+    offset = poses.position[near] - poses.position[centres, None]
+    x, y, z = np.einsum("nji,nkj->ink", rotation, offset)
     # The direction in the x-y plane stays, the length becomes the distance in space.
-    distance = np.linalg.norm(local, axis=2)
-    in_plane = local[..., :2]
-    x, y = np.moveaxis(in_plane, -1, 0)
     length = np.hypot(x, y)
-    positive_length = np.where(length > 0, length, 1.0)
-    stretch = distance / positive_length
-    place = in_plane * stretch[..., None]
+    distance = np.hypot(length, z)
+    stretch = distance / np.where(length > 0, length, 1.0)
+    place = np.stack([stretch * x, stretch * y], axis=2)
 
     # A tilted neighbour gets the rotation about z that is closest to its rotation in space.
-    rotations = poses.rotation[near]
-    relative = np.einsum("nji,nkjl->nkil", to_centre, rotations)
-    sine = relative[..., 1, 0] - relative[..., 0, 1]
-    cosine = relative[..., 0, 0] + relative[..., 1, 1]
-    angle = np.arctan2(sine, cosine)
-    return place, angle
+    relative = np.einsum("nji,nkjl->ilnk", rotation, poses.rotation[near])
+    sine = relative[1, 0] - relative[0, 1]
+    cosine = relative[0, 0] + relative[1, 1]
+    return place, np.arctan2(sine, cosine)
