@@ -25,7 +25,8 @@ from ..core.arrays import Array, Index, Mask
 from ..core.errors import ElasticError
 from ..core.modes import COMPONENTS
 from ..core.poses import CubePoses
-from .interpolation import Interpolation
+from .interpolation import NEIGHBOURS, Interpolation
+from .nearest_cubes import find_nearest_cubes
 
 if TYPE_CHECKING:
     from .tracker.contact_tracker import TrackedContact
@@ -151,15 +152,15 @@ class Surface:
         self._patches = place_patches(poses, self.spacing, side)
         self.points = self._patches.reshape(-1, 3)
         self.cube = np.repeat(np.arange(n), side**2)
-        first_point = np.arange(n) * side**2
-        self.middle = first_point + side // 2 * (side + 1)
+        self.middle = np.arange(n) * side**2 + side // 2 * (side + 1)
 
-        self._interpolation = Interpolation(
-            poses,
-            self._patches,
-            LENGTH_PER_DEPTH * depth,
+        near = find_nearest_cubes(poses, NEIGHBOURS)
+        length = LENGTH_PER_DEPTH * depth
+        pressure = PRESSURE if gradients else PRESSURE[:1]
+        self._zz, self._zz_alone, *self._shear = (
+            Interpolation(poses, near, self._patches, length, columns)
+            for columns in (pressure, PRESSURE[:1], *([column] for column in SHEAR))
         )
-        self._pressure_columns = PRESSURE if gradients else PRESSURE[:1]
         # `_pairs` (pairs, 2) are the indices of neighbouring points. A distance of 1.5 times the
         # spacing includes diagonal neighbours.
         tree = cKDTree(self.points)
@@ -172,7 +173,8 @@ class Surface:
             values: Components (cubes, 15) in the order of `COMPONENTS`, in Pa and Pa/m; NaN where
                 unknown. Around a cube without values, those of its neighbours are interpolated.
         """
-        return Field(self._interpolate_pressure(values), self._interpolate_shear(values))
+        shear = [one.interpolate(values).ravel() for one in self._shear]
+        return Field(-self._zz.interpolate(values).ravel(), np.stack(shear, axis=1))
 
     def compute_uncertainty(self, values: Array) -> Array:
         """Compute the standard deviation (M,) of the interpolated pressure at each point.
@@ -180,7 +182,7 @@ class Surface:
         It is divided by the standard deviation of the pressure over the skin: 0 at a cube with a
         value, 1 far from all cubes. Arguments as in `field`.
         """
-        return self._interpolation.compute_uncertainty(values, self._pressure_columns)
+        return self._zz.compute_uncertainty(values).ravel()
 
     def find_contacts(self, values: Array, threshold: float) -> list[Contact]:
         """Find contacts: regions in which the pressure at the cubes' depth is above two thresholds.
@@ -214,48 +216,21 @@ class Surface:
         """
         # Where neither a cube nor its neighbours have a value, the pressure is unknown (NaN) and
         # counts as zero.
-        pressure = np.nan_to_num(self._interpolate_pressure(values))
-        largest = float(pressure.max())
-        relative_threshold = RELATIVE_THRESHOLD * largest
-        inside = pressure > max(threshold, relative_threshold)
+        pressure = np.nan_to_num(-self._zz.interpolate(values))
+        inside = pressure > max(threshold, RELATIVE_THRESHOLD * pressure.max())
         if not inside.any():
             return []
 
-        shear = np.nan_to_num(self._interpolate_shear(values))
-        shear_by_patch = [self._arrange_by_patch(component) for component in shear.T]
-        moment_pressure = -self._interpolation.interpolate(values, PRESSURE[:1])
-        moment_pressure = np.nan_to_num(moment_pressure)
-        uncertainty = self.compute_uncertainty(values)
-        is_shear_known = np.isfinite(values[:, SHEAR])
         loaded = _LoadedSurface(
-            pressure=self._arrange_by_patch(pressure),
-            shear=np.stack(shear_by_patch),
-            moment_pressure=self._arrange_by_patch(moment_pressure),
-            uncertainty=self._arrange_by_patch(uncertainty),
-            sees_shear=bool(is_shear_known.any()),
+            pressure=pressure,
+            shear=np.nan_to_num([one.interpolate(values) for one in self._shear]),
+            moment_pressure=np.nan_to_num(-self._zz_alone.interpolate(values)),
+            uncertainty=self._zz.compute_uncertainty(values),
+            sees_shear=bool(np.isfinite(values[:, SHEAR]).any()),
         )
         owner = self._assign_patches(inside)
-        numbers = np.unique(owner)
-        contacts = [self._make_contact(loaded, owner == number) for number in numbers]
+        contacts = [self._make_contact(loaded, owner == number) for number in np.unique(owner)]
         return sorted(contacts, key=lambda contact: -contact.normal_force)
-
-    def _interpolate_pressure(self, values: Array) -> Array:
-        return -self._interpolation.interpolate(values, self._pressure_columns)
-
-    def _interpolate_shear(self, values: Array) -> Array:
-        columns = [self._interpolation.interpolate(values, [column]) for column in SHEAR]
-        return np.stack(columns, axis=1)
-
-    def _arrange_by_patch(self, on_points: Array) -> Array:
-        """Group values at all points by patch, the square grid of points around each cube.
-
-        Args:
-            on_points: Values (M,) at all points.
-
-        Returns:
-            The same values (cubes, points of a patch).
-        """
-        return on_points.reshape(len(self._patches), -1)
 
     def _assign_patches(self, inside: Mask) -> Index:
         """Assign the patch of each cube (square grid of points around it) to a contact.
@@ -263,30 +238,23 @@ class Surface:
         Points in contact belong to one contact if they are neighbours or lie on one patch.
 
         Args:
-            inside: Whether each point (M,) is in contact; at least one is.
+            inside: Whether each point (cubes, points of a patch) is in contact; at least one is.
 
         Returns:
             Number (cubes,) of the contact of each patch. A patch without a point in contact belongs
             to the contact of the nearest cube that has one.
         """
-        n = len(self._patches)
-        first, second = self._pairs.T
-        joined = inside[first] & inside[second]
-        joined_points = self._pairs[joined]
-        patch_pairs = self.cube[joined_points].T
         # Patches are vertices of a graph; pairs of neighbouring points in contact are its edges.
-        entries = np.ones(len(joined_points), bool)
-        links = coo_matrix((entries, patch_pairs), shape=(n, n))
+        first, second = inside.ravel()[self._pairs.T]
+        joined = self._pairs[first & second]
+        n = len(inside)
+        links = coo_matrix((np.ones(len(joined)), self.cube[joined].T), shape=(n, n))
         _, component = connected_components(links, directed=False)
 
-        inside_by_patch = inside.reshape(n, -1)
-        is_touched = inside_by_patch.any(axis=1)
-        # A patch without a point in contact joins the contact of the nearest patch that has one.
+        is_touched = inside.any(axis=1)
         position = self.poses.position
-        touched = cKDTree(position[is_touched])
-        _, nearest = touched.query(position)
-        touched_component = component[is_touched]
-        return np.asarray(touched_component[nearest], np.intp)
+        _, nearest = cKDTree(position[is_touched]).query(position)
+        return np.asarray(component[is_touched][nearest], np.intp)
 
     def _make_contact(self, loaded: _LoadedSurface, chosen: Mask) -> Contact:
         """Compute force, position and uncertainty of a contact.
@@ -302,61 +270,39 @@ class Surface:
         pressure = loaded.pressure[chosen]
         weight = loaded.moment_pressure[chosen] * self.area
         normal_force = float(pressure.sum() * self.area)
-        # The normal of the contact is the mean of its cubes' normals, weighted with the pressure.
-        cube_normals = rotation[:, :, 2]
-        cube_weights = pressure.sum(axis=1)
-        normal = _sum_weighted(cube_weights, cube_normals)
+        # The sums are einsums, because matrix products of BLAS would start threads that occupy a
+        # second core. The normal of the contact is the mean of its cubes' normals, weighted with
+        # the pressure.
+        normal = np.einsum("n,ni->i", pressure.sum(axis=1), rotation[:, :, 2])
         normal /= np.linalg.norm(normal)
 
-        shear = self._compute_shear_force(loaded.shear[:, chosen], rotation)
+        in_plane = rotation[:, :, :2]
+        by_patch = loaded.shear[:, chosen].sum(axis=2) * self.area
+        shear = np.einsum("cn,nic->i", by_patch, in_plane)
         shear -= normal * (shear @ normal)
         # The shear force acts on the surface, `depth` above the cubes' plane, and so shifts the
         # centre of pressure in this plane by depth × shear force / normal force.
-        total_weight = weight.sum()
-        centre = _sum_weighted(weight, points) / total_weight
-        force_direction = normal - shear / total_weight
-        position = centre + self.depth * force_direction
+        centre = np.einsum("nq,nqi->i", weight, points) / weight.sum()
+        position = centre + self.depth * (normal - shear / weight.sum())
 
         # Interpolation errors are correlated over one pitch (distance of neighbouring cubes), so
         # the errors of the pitch / spacing points along each axis add up instead of averaging out.
         pressure_deviation = loaded.uncertainty[chosen] * pressure
         variance = (pressure_deviation * self.pitch * self.spacing) ** 2
-        lever = points - centre
         # The lever lies in the surface. Along one axis, its mean square is half of its square.
-        squared_lever = (lever**2).sum(axis=2) / 2
-        moment_variance = (variance * squared_lever).sum()
-        moment_deviation = np.sqrt(moment_variance)
-        is_pressed = pressure > 0.5 * pressure.max()
-        n_pressed = np.count_nonzero(is_pressed)
-        shear_force = np.nan
-        if loaded.sees_shear:
-            shear_force = float(np.linalg.norm(shear))
+        squared_lever = ((points - centre) ** 2).sum(axis=2) / 2
+        moment_deviation = np.sqrt((variance * squared_lever).sum())
+        n_pressed = np.count_nonzero(pressure > 0.5 * pressure.max())
         return Contact(
             position=position,
             normal=normal,
             force=shear - normal * normal_force,
             normal_force=normal_force,
-            shear_force=shear_force,
-            area=float(n_pressed * self.area),
+            shear_force=float(np.linalg.norm(shear)) if loaded.sees_shear else np.nan,
+            area=n_pressed * self.area,
             position_uncertainty=float(moment_deviation / normal_force),
             force_uncertainty=float(np.sqrt(variance.sum())),
         )
-
-    def _compute_shear_force(self, shear: Array, rotation: Array) -> Array:
-        """Integrate the shear stress over some patches.
-
-        Args:
-            shear: Shear stresses σzx and σyz (2, patches, points) in Pa, in the frames of the
-                cubes.
-            rotation: Rotations (patches, 3, 3) of these frames.
-
-        Returns:
-            Shear force (3,) in N, in the skin's parent frame.
-        """
-        by_patch = shear.sum(axis=2)
-        along_x = _sum_weighted(by_patch[0], rotation[:, :, 0])
-        along_y = _sum_weighted(by_patch[1], rotation[:, :, 1])
-        return (along_x + along_y) * self.area
 
 
 class _LoadedSurface(NamedTuple):
@@ -389,8 +335,7 @@ def make_square_points(spacing: float, side: int) -> Array:
     Returns:
         Positions (side^2, 2) in m.
     """
-    steps = np.arange(side) - (side - 1) / 2
-    line = steps * spacing
+    line = (np.arange(side) - (side - 1) / 2) * spacing
     x, y = np.meshgrid(line, line)
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
@@ -411,18 +356,6 @@ def place_patches(
         Positions (cubes, side^2, 3) in the skin's parent frame, in m. Each grid lies in the x-y
         plane of its cube.
     """
-    in_plane = poses.rotation[:, :, :2]
     grid = make_square_points(spacing, side)
-    offset = np.einsum("nij,qj->nqi", in_plane, grid)
+    offset = np.einsum("nij,qj->nqi", poses.rotation[:, :, :2], grid)
     return np.asarray(poses.position[:, None] + offset)
-
-
-def _sum_weighted(weights: Array, vectors: Array) -> Array:
-    """Return the weighted sum (3,) of vectors (..., 3) with the weights (...).
-
-    The function uses einsum, because a BLAS matrix product would start threads that occupy a second
-    core.
-    """
-    rows = vectors.reshape(-1, 3)
-    result: Array = np.einsum("n,ni->i", weights.ravel(), rows)
-    return result
