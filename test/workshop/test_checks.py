@@ -22,9 +22,11 @@ from cube_tensor_driver.simulation.faults import PAD_FAULTS, Fault
 from cube_tensor_driver.simulation.injector import compute_broken_reading
 from cube_tensor_driver.simulation.load import Load, read_default_script
 from cube_tensor_driver.simulation.sample_log import FaultRecord, LinkLog, SampleLog, SampleRun
+from workshop.checks import timing
 from workshop.checks.all_checks import check_all
 from workshop.checks.record import NodeAction, Received, Record, Samples
 from workshop.checks.rest import TRANSPORT_S
+from workshop.checks.run import Run
 from workshop.checks.sent_readings import SentReadings, make_reading_type
 
 INSTANTS, COUNT, PERIOD_US, EACH = 400, 2000, 2000, 2
@@ -344,3 +346,16 @@ def test_what_did_not_arrive_here_is_not_checked(played):
     figures = check_all(record, log, readings)
     assert figures["missed_by_judge"] == 100
     assert {name for name in WRONG if figures[name]} == set()
+
+
+def test_stamps_are_checked_from_a_time_after_the_first_row_of_each_link(played, monkeypatch):
+    """The driver began long before. The first row of hub1 comes after 2.5 s."""
+    monkeypatch.setattr(timing, "CLOCK_SETTLE_S", 1.0)
+    record, log, readings = played
+    rows = record.frequencies.rows
+    rest = rows.select((rows.cube < EACH) | (rows.stamp_ns >= 2_500_000_000))
+    record = replace(record, begin_ns=-(10**10), frequencies=received(rest))
+    errors_ms = timing.measure_stamp_errors(Run(record, log, readings))
+    # of 4 s: the last 3 s of hub0 and 0.5 s of hub1
+    assert len(errors_ms) == pytest.approx(500 * 3.5, abs=3)
+    assert errors_ms == pytest.approx(0.1)

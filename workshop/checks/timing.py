@@ -11,7 +11,7 @@ from cube_tensor_driver.core.matching import NO_MATCH
 from cube_tensor_driver.core.status import STAMP
 
 from .frequencies import RECOVERY_S, FrequencyFindings
-from .record import CUT_FAULTS, DRIVER_KILLS, DRIVER_STOPS, NS_PER_S, Span
+from .record import CUT_FAULTS, DRIVER_KILLS, DRIVER_STOPS, LATEST_NS, NS_PER_S, Span
 from .run import Run
 
 MS_PER_NS = 1e-6
@@ -25,8 +25,9 @@ BEFORE_FAULT_S = 0.1
 affected."""
 
 CLOCK_SETTLE_S = 6.0
-"""Time, in seconds, after a restart of a hub or of the driver from which stamps are checked,
-because the rate of the hub's clock is known then."""
+"""Time, in seconds, after a restart of a hub or of the driver and after the first row (one cube at
+one sampling time) of a link from which stamps are checked, because the rate of the hub's clock is
+known then."""
 
 RATE_CHANGE_S = 1.0
 """Longest time, in seconds, from a request until each hub whose link is not cut must sample at the
@@ -45,8 +46,7 @@ def measure_stamp_errors(run: Run) -> Array:
     whose stamps the driver does not mark as doubtful.
     """
     record, samples = run.record, run.samples
-    settled = samples.time_ns > record.begin_ns + NS_PER_S * CLOCK_SETTLE_S
-    settled &= ~samples.is_near_fault(CLOCK_FAULTS, BEFORE_FAULT_S, CLOCK_SETTLE_S)
+    settled = ~samples.is_near_fault(CLOCK_FAULTS, BEFORE_FAULT_S, CLOCK_SETTLE_S)
     settled &= ~record.is_during(DRIVER_KILLS, samples.time_ns, after_s=CLOCK_SETTLE_S)
 
     # All cubes of a hub have the same stamp, so one of each is enough.
@@ -56,8 +56,14 @@ def measure_stamp_errors(run: Run) -> Array:
     is_first = np.isin(rows.cube, first_cubes)
     chosen = np.flatnonzero(is_first & is_certain)
     chosen = chosen[run.sample[chosen] != NO_MATCH]
-    chosen = chosen[settled[run.sample[chosen]]]
+    # On a busy machine, the first row of a link comes seconds after the start of the driver.
+    link = samples.link[run.sample[chosen]]
+    first_ns = np.full(len(first_cubes), LATEST_NS)
+    np.minimum.at(first_ns, link, record.frequencies.sent_ns[chosen])
+    settled_rows = settled[run.sample[chosen]]
     taken_ns = samples.time_ns[run.sample[chosen]]
+    settled_rows &= taken_ns - first_ns[link] > NS_PER_S * CLOCK_SETTLE_S
+    chosen, taken_ns = chosen[settled_rows], taken_ns[settled_rows]
     return (rows.stamp_ns[chosen] - taken_ns) * MS_PER_NS
 
 
