@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from test_clock import EPOCH_NS
 
-from cube_tensor_driver.device.clock.hub_clock import BAD_ANSWERS, HubClock
+from cube_tensor_driver.device.clock.hub_clock import BAD_ANSWERS, CLOCK_SET, HubClock
 from cube_tensor_driver.device.links.session import ASK_TIME_S
 
 DRIFT_PPM = 40.0
@@ -138,3 +138,44 @@ def test_bounds_that_answers_contradict_are_forgotten() -> None:
             assert clock.problems == {BAD_ANSWERS} and clock.line.error_bound is None
     (stamp_ns,) = clock.update([20_000_000], EPOCH_NS + 20_020_000_000, [2000])
     assert abs(stamp_ns - EPOCH_NS - 20_000_000_000) < 100_000
+
+
+@pytest.mark.parametrize("last_answer", [1000, 3000])
+def test_samples_that_are_late_for_seconds_keep_their_stamps(last_answer) -> None:
+    """By up to 2 s, as those of a hub without processor time, which may not answer either."""
+    clock = HubClock()
+    for k in range(3000):
+        true_ns = EPOCH_NS + 10_000_000 * k
+        late_ns = 2_000_000 * max(0, min(k - 1000, 1000, 3000 - k))
+        (stamp_ns,) = clock.update([10_000 * k], true_ns + 100_000 + late_ns, [k])
+        if k % 100 == 0 and k <= last_answer:
+            clock.add_answer(true_ns - 100_000, 10_000 * k, true_ns + 100_000)
+        assert abs(stamp_ns - true_ns) <= 101_000, k
+    assert not clock.problems and clock.resets == 0
+
+
+@pytest.mark.parametrize("step_ns", [30_000_000, 3600 * 10**9])
+def test_answers_tell_a_clock_that_was_set_from_samples_that_are_late(step_ns) -> None:
+    """Simulated time that jumps. No step of it is found by the monotonic clock."""
+    clock = HubClock()
+    for k in range(3000):
+        true_ns = EPOCH_NS + 10_000_000 * k + (step_ns if k >= 1000 else 0)
+        (stamp_ns,) = clock.update([10_000 * k], true_ns + 100_000, [k])
+        if k % 98 == 0:
+            clock.add_answer(true_ns - 100_000, 10_000 * k, true_ns + 100_000)
+        assert 1000 <= k < 1300 or abs(stamp_ns - true_ns) <= 101_000, k
+    assert clock.problems == {CLOCK_SET} and clock.resets == 1
+
+
+@pytest.mark.parametrize("late_ms", [15, 500])
+def test_stamps_that_wait_for_an_earlier_one_that_was_too_late_are_in_doubt(late_ms) -> None:
+    """The first samples come late, which an answer shows after 1 s."""
+    clock = HubClock()
+    for k in range(300):
+        true_ns = EPOCH_NS + 10_000_000 * k
+        (stamp_ns,) = clock.update([10_000 * k], true_ns + 1_000_000 * late_ms, [k])
+        error_ms = 1e-6 * (stamp_ns - true_ns)
+        assert k <= 100 or clock.in_doubt == (error_ms > 20), k
+        if k == 100:
+            clock.add_answer(true_ns - 100_000, 10_000 * k, true_ns + 100_000)
+    assert error_ms == pytest.approx(0, abs=0.1)

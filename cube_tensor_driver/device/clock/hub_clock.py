@@ -19,7 +19,7 @@ from collections.abc import Sequence
 
 from ...core.rows import COUNTER_RANGE
 from ..track import MAX_DEVICE_US, NEVER, LinkTrack
-from .line import MAX_DELAY_NS, ClockLine
+from .line import MAX_DELAY_NS, MAX_RISE_NS, ClockLine
 
 MAX_PAUSE_NS = 60_000_000_000
 """Longest pause between samples, in ns, after which the clock line (host time over device time) is
@@ -333,7 +333,10 @@ class HubClock:
                 # A sample that came out of order must not get a later stamp than the newest one.
                 stamp = min(stamp, track.last_stamp_ns)
             else:
-                self.in_doubt |= stamp < min(self._doubtful_stamp, track.last_stamp_ns)
+                # Stamps must not decrease, so a stamp is too late if an earlier one was.
+                is_raised_much = track.last_stamp_ns - stamp > MAX_RISE_NS
+                is_raised = stamp < min(self._doubtful_stamp, track.last_stamp_ns)
+                self.in_doubt |= is_raised or is_raised_much
                 track.newest_ns = max(device_ns, track.newest_ns)
                 track.last_stamp_ns = stamp = max(stamp, track.last_stamp_ns)
             stamps.append(stamp)

@@ -44,7 +44,8 @@ pauses and reads many samples late."""
 MAX_RISE_NS = 20e6
 """Largest credible rise, in ns, of the smallest delay in a bucket (1 s) above the clock line (host
 time over device time). USB adapters delay samples by up to 16 ms. If the rises of two successive
-buckets are larger, a clock was set; a single larger one may come from a pause of the host."""
+buckets are larger, a clock was set, unless round trips show that only the samples are late; a
+single larger rise may come from a pause of the host."""
 MAX_FALL_NS = 4e6
 """Largest credible fall, in ns, of the smallest delay in a bucket (1 s) below the clock line (host
 time over device time). A larger fall means that a clock was set. Steps of 5 ms shall be found."""
@@ -87,6 +88,7 @@ class ClockLine:
     def forget_round_trips(self) -> None:
         """Discard the bounds from all round trips."""
         self.error_bound: float | None = None
+        self._is_contradicted = False  # whether the last round trip contradicted earlier ones
         self._low, self._high = -math.inf, math.inf
         self._answered_ns = 0.0  # device time for which the bounds hold
         self._set_bounded_offset()
@@ -162,7 +164,8 @@ class ClockLine:
             self._high + drifted + tolerance,
             line + MAX_FALL_NS,
         )
-        if low > high:
+        self._is_contradicted = low > high
+        if self._is_contradicted:
             return False
         self._low, self._high, self._answered_ns = low, high, device_ns
         self.error_bound = (high - low) / 2
@@ -179,11 +182,17 @@ class ClockLine:
         """
         track = self._track
         rise = track.offset + height - self._fitted_offset
-        was_set = rise < -MAX_FALL_NS or (self._rose and rise > MAX_RISE_NS)
+        # Samples that are late for seconds rise, too, but the round trips still agree then.
+        may_be_late = self.error_bound is not None and not self._is_contradicted
+        is_too_high = self._rose and rise > MAX_RISE_NS and not may_be_late
+        was_set = rise < -MAX_FALL_NS or is_too_high
         self._rose = rise > MAX_RISE_NS and not was_set
         if was_set:
             self._points.clear()
             self.forget_round_trips()
+        if self._rose:
+            # If all samples are late for half of the points, these would look like drift.
+            return False
         line = track.offset + track.drift * track.earliest_ns
         self._points.append((track.earliest_ns, line + height))
         x, y = np.array(self._points).T  # device times; arrivals minus device times
