@@ -18,6 +18,7 @@ the integrals of the field, which are less exact.
 from __future__ import annotations
 
 import math
+from itertools import accumulate, compress
 from typing import NamedTuple
 
 import numpy as np
@@ -171,32 +172,7 @@ class ContactTracker:
         if max_work > 0:
             self._improve_fits(max_work)
 
-        contacts = []
-        for region in regions:
-            for one in region.estimate_contacts():
-                if one.force[2] < 0:
-                    contacts.append((region, one))
-        positions, cubes, rotations = self._to_parent_frame(contacts)
-        ids = self._number_contacts(positions)
-        fits = [(number, region.fit) for number, (region, _) in zip(ids, contacts, strict=True)]
-        self.single_fits = {
-            number: fit
-            for number, fit in fits
-            if isinstance(fit, HertzFit) and len(fit.found.forces) == 1
-        }
-        normals = inverse.poses.rotation[cubes, :, 2]
-        places = zip(
-            ids,
-            positions,
-            normals,
-            rotations,
-            contacts,
-            strict=True,
-        )
-        found = [
-            _describe_contact(number, position, normal, rotation, one, region.is_refined)
-            for number, position, normal, rotation, (region, one) in places
-        ]
+        found = self._describe_contacts()
         return sorted(found, key=lambda contact: -contact.normal_force)
 
     @property
@@ -281,44 +257,36 @@ class ContactTracker:
         unmatched: list[TrackedRegion | None] = [*self._regions, None]
         regions = []
         is_changed = len(found) != len(self._regions)
-        for points in found:
-            n_common = np.bincount(owner[points], minlength=len(unmatched))
+        for points, peak in found:
+            n_common = np.bincount(owner.take(points), minlength=len(unmatched))
             n_common[-1] = 0
             best = int(n_common.argmax())
             old = unmatched[best] if n_common[best] else None
             unmatched[best] = None
             region = old or TrackedRegion(self._inverse, self._noise, self._respond)
-            peak = float(pressure[points].max())
             is_changed |= points is not region.points
             region.begin_scan(points, peak)
             regions.append(region)
         self._regions = regions
-        if not is_changed:
-            return
-        distances = self._measure_region_distances(found)
-        for number, (region, row) in enumerate(zip(regions, distances, strict=True)):
-            is_near = row < NEIGHBOUR_REACH_PITCHES * self._inverse.pitch
-            within_reach = [regions[k] for k in np.flatnonzero(is_near)]
-            region.near = [other for other in within_reach if other is not region]
-            to_others = np.delete(row, number)
-            region.gap = float(to_others.min(initial=np.inf))
+        if is_changed and regions:
+            distances = self._measure_region_distances()
+            are_near = distances < NEIGHBOUR_REACH_PITCHES * self._inverse.pitch
+            rows = zip(regions, are_near.tolist(), distances.min(axis=1).tolist(), strict=True)
+            for region, is_near, region.gap in rows:
+                region.near = list(compress(regions, is_near))
 
-    def _measure_region_distances(self, found: list[Index]) -> Array:
-        """Return the distances (n, n), in m, between n regions.
+    def _measure_region_distances(self) -> Array:
+        """Return the distances (n, n), in m, between n regions, infinite from a region to itself.
 
         The distance of two regions is that of their two nearest points.
-
-        Args:
-            found: Indices of the points of the surface in each region.
         """
-        if not found:
-            return np.zeros((0, 0))
-        sizes = [len(one) for one in found]
-        starts = np.cumsum([0, *sizes[:-1]])
-        points = self._inverse.points[np.concatenate(found)]
-        distances = cdist(points, points)
+        points = [region.points for region in self._regions]
+        starts = list(accumulate(map(len, points[:-1]), initial=0))
+        positions = self._inverse.points.take(np.concatenate(points), axis=0)
+        distances = cdist(positions, positions)
         to_points = np.minimum.reduceat(distances, starts, axis=0)
         to_regions = np.minimum.reduceat(to_points, starts, axis=1)
+        np.fill_diagonal(to_regions, np.inf)
         return np.asarray(to_regions)
 
     def _update_fits(self) -> None:
@@ -335,30 +303,31 @@ class ContactTracker:
         linearise(self._inverse, due)
         if len(fitted) > 1:
             update_responses(self._inverse, fitted, self._fitted_cubes)
-        total, deviation = self._sum_responses(slice(None))
+        total, deviation = self._sum_responses(self._fitted_cubes)
         for region in fitted:
             fit = region.fit
             if fit is not None:
                 cubes = fit.values.cubes
-                region.subtract_others(
-                    fit.values,
-                    total[cubes],
-                    deviation[cubes],
-                )
-                before = region.response[cubes]
+                others = region.subtract_others(fit.values, total, deviation)
                 region.step()
-                total[cubes] += region.response[cubes] - before
+                total[cubes] = others + region.response.take(cubes, axis=0)
 
-    def _sum_responses(self, cubes: Index | slice) -> tuple[Array, Array]:
-        """Return the stored response (n, C), in Pa, of n cubes to all regions, and its standard
-        deviation (n, C)."""
-        total = np.zeros_like(self._scaled[cubes])
-        deviation = np.zeros_like(total)
-        for region in self._regions:
-            response = region.response[cubes]
-            total += response
-            # Deviations add linearly, because the same errors of the elastomer cause them.
-            deviation += region.relative_error * np.abs(response)
+    def _sum_responses(self, cubes: Index) -> tuple[Array, Array]:
+        """Return the stored response of some cubes to all regions, and its standard deviation.
+
+        Args:
+            cubes: Indices (n,) of the cubes.
+
+        Returns:
+            Two arrays (cubes of the skin, C) in Pa, 0 for all other cubes.
+        """
+        total = np.zeros(self._scaled.shape)
+        deviation = np.zeros(self._scaled.shape)
+        responses = [region.response.take(cubes, axis=0) for region in self._regions]
+        total[cubes] = sum(responses)
+        # Deviations add linearly, because the same errors of the elastomer cause them.
+        pairs = zip(self._regions, responses, strict=True)
+        deviation[cubes] = sum(region.relative_error * np.abs(one) for region, one in pairs)
         return total, deviation
 
     def _respond(self, cubes: Index) -> tuple[Array, Array]:
@@ -413,7 +382,7 @@ class ContactTracker:
         self._noise.update(self._scaled, cubes)
         if len(self._regions) > 1:
             update_responses(inverse, self._regions, cubes)
-        responses = self._sum_responses(slice(None))
+        responses = self._sum_responses(cubes)
         started = [
             region.start_hertz(home, *responses)
             for region, home in zip(regions, homes, strict=True)
@@ -498,40 +467,61 @@ class ContactTracker:
             aspect=1.0,
         )
 
+    def _describe_contacts(self) -> list[TrackedContact]:
+        """Describe the contacts of all regions, and set `single_fits`."""
+        refined = {region: region.is_refined for region in self._regions}
+        contacts = [
+            (region, one)
+            for region, is_refined in refined.items()
+            for one in region.estimate_contacts(is_refined)
+            if one.force[2] < 0
+        ]
+        positions, rotations = self._to_parent_frame(contacts)
+        ids = self._number_contacts(positions)
+        fits = {number: region.fit for number, (region, _) in zip(ids, contacts, strict=True)}
+        self.single_fits = {
+            number: fit
+            for number, fit in fits.items()
+            if isinstance(fit, HertzFit) and len(fit.found.forces) == 1
+        }
+        return [
+            _describe_contact(number, position, rotation, one, refined[region])
+            for number, position, rotation, (region, one) in zip(
+                ids,
+                positions,
+                rotations,
+                contacts,
+                strict=True,
+            )
+        ]
+
     def _to_parent_frame(
         self,
         contacts: list[tuple[TrackedRegion, ContactEstimate]],
-    ) -> tuple[Array, Index, Array]:
+    ) -> tuple[Array, Array]:
         """Find where n contacts are on the skin, from their positions on the skin laid flat.
 
         Args:
             contacts: The estimates, with their regions.
 
         Returns:
-            Positions (n, 3) in m in the skin's parent frame, indices (n,) of the nearest cubes, and
-            rotations (n, 3, 3) from the frame of the estimate to the parent frame.
+            Positions (n, 3) in m in the skin's parent frame, and rotations (n, 3, 3) from the frame
+            of the estimate to the parent frame.
         """
         inverse = self._inverse
         n = len(contacts)
         cubes = np.zeros(n, np.intp)
-        local = np.full((n, 3), inverse.depth)
         angles = np.zeros(n)
+        from_cubes = np.full((n, 3), inverse.depth)
         for number, (region, one) in enumerate(contacts):
-            places, angle = inverse.unroll(region.frame, slice(None))
-            x, y = (one.place - places).T
-            cube = (x * x + y * y).argmin()
-            cubes[number], angles[number] = cube, angle[cube]
-            local[number, :2] = x[cube], y[cube]
-        to_cubes = make_rotations_about_normal(angles)
-        in_cubes = local.copy()
-        in_cubes[:, :2] = np.einsum(
-            "nij,nj->ni",
-            to_cubes[:, :2, :2],
-            local[:, :2],
-        )
-        rotation = inverse.poses.rotation[cubes]
-        positions = inverse.poses.position[cubes] + np.einsum("nij,nj->ni", rotation, in_cubes)
-        return positions, cubes, rotation @ to_cubes
+            places, cube_angles = inverse.unroll(region.frame, slice(None))
+            offset = one.place - places
+            cube = np.einsum("nk,nk->n", offset, offset).argmin()
+            cubes[number], angles[number] = cube, cube_angles[cube]
+            from_cubes[number, :2] = offset[cube]
+        rotations = inverse.poses.rotation[cubes] @ make_rotations_about_normal(angles)
+        positions = inverse.poses.position[cubes] + np.einsum("nij,nj->ni", rotations, from_cubes)
+        return positions, rotations
 
     def _number_contacts(self, positions: Array) -> list[int]:
         """Return the id of each contact: that of the nearest one in the previous scan, or a new id.
@@ -539,13 +529,15 @@ class ContactTracker:
         Args:
             positions: Positions (n, 3) of the contacts in m.
         """
-        distance = cdist(positions, self._last_positions)
         ids = [-1] * len(positions)
-        rows, columns = np.nonzero(distance < MATCH_PITCHES * self._inverse.pitch)
-        nearest_first = np.argsort(distance[rows, columns], kind="stable")
-        for pair in nearest_first.tolist():
-            row = int(rows[pair])
-            number = self._last_ids[columns[pair]]
+        distances = cdist(positions, self._last_positions).tolist()
+        pairs = [
+            (distance, row, number)
+            for row, to_last in enumerate(distances)
+            for distance, number in zip(to_last, self._last_ids, strict=True)
+            if distance < MATCH_PITCHES * self._inverse.pitch
+        ]
+        for _, row, number in sorted(pairs):
             if ids[row] < 0 and number not in ids:
                 ids[row] = number
         for row, number in enumerate(ids):
@@ -559,7 +551,6 @@ class ContactTracker:
 def _describe_contact(
     number: int,
     position: Array,
-    normal: Array,
     rotation: Array,
     estimate: ContactEstimate,
     is_refined: bool,
@@ -569,8 +560,7 @@ def _describe_contact(
     Args:
         number: Its id.
         position: Position (3,) in m.
-        normal: Unit normal (3,) out of the skin.
-        rotation: Rotation (3, 3) from the frame of the estimate.
+        rotation: Rotation (3, 3) from the frame of the estimate, whose z axis is the normal.
         estimate: Force of the contact, with variances, on the flattened skin.
         is_refined: Value of `TrackedContact.refined`.
     """
@@ -583,7 +573,7 @@ def _describe_contact(
     return TrackedContact(
         id=number,
         position=position,
-        normal=normal,
+        normal=rotation[:, 2],
         force=rotation @ estimate.force,
         normal_force=-z,
         shear_force=shear,

@@ -180,9 +180,8 @@ class HertzFit:
         # first scan of a fit there are none.
         self._previous: Discs | None = None
         n_contacts = len(starts.forces)
-        # `_change` are the changes of the parameters by the last step. Every step begins with
-        # flatness and moment 0, so the changes of these two are their values.
-        self._change = np.zeros((n_contacts, _N_PARAMETERS))
+        # `_lengths` are the units of the three columns of a step in `SETTLED_STEP`.
+        self._lengths = np.array([depth, depth, 1.0])
         flatness_deviation = 1.0
         moment_deviation = FORCE_DEVIATION * depth
         deviations = [
@@ -194,7 +193,10 @@ class HertzFit:
         ]
         precision = np.array(deviations) ** -2
         self.contact_precision = np.tile(precision, n_contacts)
-        self._elastomer_errors = np.zeros(1)  # the first error is that of the depth
+        # `_changes` are the changes of all parameters by the last step: 8 of each contact, then the
+        # errors of the elastomer, of which the first is that of the depth. Every step begins with
+        # flatness, moment and errors 0, so the changes of these are their values.
+        self._changes = np.zeros(len(self.contact_precision) + 1)
 
     @property
     def elastomer_precision(self) -> float:
@@ -205,7 +207,7 @@ class HertzFit:
     def depth_error(self) -> float:
         """Error of the depth of the cubes' centres that the last step has found, divided by the
         depth."""
-        return DEPTH_DEVIATION * float(self._elastomer_errors[0])
+        return DEPTH_DEVIATION * float(self._changes[len(self.contact_precision)])
 
     @property
     def displacement(self) -> float:
@@ -214,11 +216,10 @@ class HertzFit:
         It is measured like the size of a step in `SETTLED_STEP`.
         """
         found, base = self.found, self.linear.contacts
-        shift = found.centres - base.centres
-        growth = found.log_sizes - base.log_sizes
-        largest_shift = np.abs(shift).max() / self._depth
-        largest_growth = np.abs(growth).max()
-        return float(max(largest_shift, largest_growth))
+        shift = (found.centres - base.centres).ravel().tolist()
+        growth = (found.log_sizes - base.log_sizes).tolist()
+        largest_shift = max(map(abs, shift)) / self._depth
+        return float(max(largest_shift, *map(abs, growth)))
 
     @property
     def is_inexact(self) -> bool:
@@ -282,8 +283,7 @@ class HertzFit:
     def explained(self) -> Array:
         """Components (n, C), in Pa, that the contacts `found` cause in the n cubes around the
         region, by the linearised response `linear`."""
-        changes = np.append(self._change, self._elastomer_errors)
-        return np.asarray(self.linear.values + self.linear.derivatives @ changes)
+        return np.asarray(self.linear.values + self.linear.derivatives @ self._changes)
 
     def predict(self, extrapolates: bool) -> None:
         """Set the contacts at which the fit of a new scan (set of values of all cubes) begins.
@@ -296,8 +296,8 @@ class HertzFit:
         self._previous = found
         if extrapolates and previous is not None:
             limit = _MAX_STEP * self._depth
-            shift = (found.centres - previous.centres).clip(-limit, limit)
-            centres = found.centres + shift
+            shift = found.centres - previous.centres
+            centres = found.centres + np.maximum(np.minimum(shift, limit), -limit)
             forces = 2 * found.forces - previous.forces
             self.found = found._replace(centres=centres, forces=forces)
 
@@ -346,15 +346,19 @@ class HertzFit:
 
         known = self.values.known
         new_residual = residual - linear.jacobian @ change
-        new_residual = new_residual.reshape(known.shape)
-        near_residual = new_residual[linear.nearest]
-        near_square = float((near_residual**2).sum())
-        near_count = int(known[linear.nearest].sum())
+        near_residual = new_residual.reshape(known.shape)[linear.nearest]
+        near_square = float(np.vdot(near_residual, near_residual))
+        near_count = int(np.count_nonzero(known[linear.nearest]))
         self.shape_misfit = near_square / max(near_count, 1)
 
+        self._changes = change
+        self._move_contacts(self._contact_changes)
+
+    @property
+    def _contact_changes(self) -> Array:
+        """Changes (J, 8) of the parameters of the contacts by the last step."""
         n_parameters = len(self.contact_precision)
-        self._elastomer_errors = change[n_parameters:]
-        self._move_contacts(change[:n_parameters].reshape(-1, _N_PARAMETERS))
+        return self._changes[:n_parameters].reshape(-1, _N_PARAMETERS)
 
     def compute_weights(self, cubes: Index) -> Array:
         """Return the derivatives of force and position of the first contact by the values of cubes.
@@ -387,13 +391,13 @@ class HertzFit:
                 are limited to `_MAX_STEP` in place.
         """
         base = self.linear.contacts
-        lengths = np.array([self._depth, self._depth, 1.0])
-        steps = (change[:, 3:6] / lengths).clip(-_MAX_STEP, _MAX_STEP)
-        self.last_step = float(np.abs(steps).max())
-        change[:, 3:6] = steps * lengths
-        log_sizes = (base.log_sizes + change[:, 5]).clip(*self._log_range)
+        steps = change[:, 3:6] / self._lengths
+        steps = np.maximum(np.minimum(steps, _MAX_STEP), -_MAX_STEP)
+        self.last_step = max(map(abs, steps.ravel().tolist()))
+        change[:, 3:6] = steps * self._lengths
+        smallest, largest = self._log_range
+        log_sizes = np.maximum(np.minimum(base.log_sizes + change[:, 5], largest), smallest)
         change[:, 5] = log_sizes - base.log_sizes
-        self._change = change
         self.found = Discs(
             base.forces + change[:, :3],
             base.centres + change[:, 3:5],
@@ -437,7 +441,7 @@ class HertzFit:
         slopes[:, 3:7] = patterns[1:, None] * self.found.forces[:, None, :, None]
         slopes[:, 7, 1] = patterns[1] / 2
         slopes[:, 7, 0] = -patterns[2] / 2
-        shape = self._change[:, 6:, None, None] * slopes[:, 6:]
+        shape = self._contact_changes[:, 6:, None, None] * slopes[:, 6:]
         forces = self.found.forces[:, :, None] * patterns[0] + shape.sum(axis=1)
 
         # Errors of different contacts of a region are treated as independent here.
@@ -454,30 +458,24 @@ class HertzFit:
         )
 
     @property
-    def _covariances(self) -> Array:
-        """Covariances (J, 8, 8) of the parameters of each contact."""
-        n_contacts = len(self.found.forces)
-        n_parameters = n_contacts * _N_PARAMETERS
-        covariance = self.inflation * self.linear.covariance[:n_parameters, :n_parameters]
-        blocks = covariance.reshape(
-            n_contacts,
-            _N_PARAMETERS,
-            n_contacts,
-            _N_PARAMETERS,
-        )
-        contact = np.arange(n_contacts)
-        return np.asarray(blocks[contact, :, contact])
+    def _covariances(self) -> list[Array]:
+        """Covariance (8, 8) of the parameters of each contact."""
+        covariance = self.inflation * self.linear.covariance
+        starts = range(0, len(self.contact_precision), _N_PARAMETERS)
+        blocks = [slice(start, start + _N_PARAMETERS) for start in starts]
+        return [covariance[block, block] for block in blocks]
 
     def estimate_contacts(self) -> list[ContactEstimate]:
         """Return force, position, moment and area of each contact."""
         estimates = []
         for force, centre, log_size, change, covariance in zip(
             *self.found,
-            self._change,
+            self._contact_changes,
             self._covariances,
             strict=True,
         ):
             variances = covariance.diagonal()
+            *_, size_variance, _, moment_variance = variances.tolist()
             area = math.pi * math.exp(2 * log_size)
             estimate = ContactEstimate(
                 force=force,
@@ -485,10 +483,10 @@ class HertzFit:
                 place=centre,
                 place_variance=variances[3:5],
                 moment=float(change[7]),
-                moment_variance=float(variances[7]),
+                moment_variance=moment_variance,
                 area=area,
                 # The derivative of the area pi exp(2 ln a) by ln a is 2 area.
-                area_variance=float((2 * area) ** 2 * variances[5]),
+                area_variance=(2 * area) ** 2 * size_variance,
                 aspect=1.0,
             )
             estimates.append(estimate)

@@ -80,35 +80,27 @@ class CubeNoise:
             # and are set to 0.
             self._revision = inverse.revision
             self._variance[:] = 0.0
-        values = scaled[cubes]
-        known = np.isfinite(values) & inverse.observed[cubes]
-        values = np.where(known, values, 0.0)
-        known_before = self.known[cubes]
-        is_other_value = known != known_before
-        has_other_values = is_other_value.any(axis=1)
-        variance_of_first_pad = self._variance[cubes, 0]
-        has_no_variance = variance_of_first_pad == 0
-        is_outdated = has_other_values | has_no_variance
-        if is_outdated.any():
-            outdated = cubes[is_outdated]
-            self._replace_pads(outdated, known[is_outdated])
-        columns = values[:, :, None]
-        stresses = self._to_pads.take(cubes, axis=0) @ columns
-        stresses = stresses[:, :, 0]
+        values = scaled.take(cubes, axis=0)
+        known = np.isfinite(values) & inverse.observed.take(cubes, axis=0)
+        is_other_value = known != self.known.take(cubes, axis=0)
+        is_outdated = self._variance[cubes, 0] == 0
+        if is_outdated.any() or is_other_value.any():
+            is_outdated |= is_other_value.any(axis=1)
+            self._replace_pads(cubes[is_outdated], known[is_outdated])
+        columns = np.where(known, values, 0.0)[:, :, None]
+        stresses = (self._to_pads.take(cubes, axis=0) @ columns)[:, :, 0]
 
         # The predicted stress of a pad is wrong by interpolation errors of the tabulated response
         # and by contacts that are not found yet. Both grow with the stress in the cubes around.
         magnitudes = np.abs(stresses)
         self._peak[cubes] = magnitudes.max(axis=1)
-        around = inverse.near[cubes]
-        largest_around = self._peak[around].max(axis=1)
-        model_deviation = MODEL_ERROR * largest_around
+        around = inverse.near.take(cubes, axis=0)
+        model_deviation = MODEL_ERROR * self._peak.take(around).max(axis=1)
         gain_deviation = GAIN_ERROR * stresses
-        gain_variance = gain_deviation**2
-        model_variance = model_deviation**2
-        variance = 1 + gain_variance + model_variance[:, None]
+        variance = gain_deviation**2
+        variance += (1 + model_deviation**2)[:, None]
 
-        before = self._variance[cubes]
+        before = self._variance.take(cubes, axis=0)
         larger = np.maximum(variance, before)
         smaller = np.minimum(variance, before)
         is_pad_changed = larger > MAX_NOISE_CHANGE * smaller
@@ -140,7 +132,7 @@ class CubeNoise:
             variance: Variances (n, P) of the errors of the stresses on their P pads, divided by the
                 variance of the pad's noise without load.
         """
-        by_pad = self._by_pad[cubes]
+        by_pad = self._by_pad.take(cubes, axis=0)
         weighted = by_pad * variance[:, None]
         covariance = weighted @ by_pad.swapaxes(1, 2)
         is_known = self.known[cubes]
@@ -211,25 +203,24 @@ class LocalValues:
         smaller weight.
         """
         cubes, noise = self.cubes, self._noise
-        self._versions = noise.version[cubes]
-        self.variant = self._inverse.variant[cubes]
-        self.known = noise.known[cubes]
-        self.count = int(self.known.sum())
+        self._versions = noise.version.take(cubes)
+        self.variant = self._inverse.variant.take(cubes)
+        self.known = noise.known.take(cubes, axis=0)
+        self.count = int(np.count_nonzero(self.known))
         self._total_disturbance = float(self.disturbance.sum())
 
         # The noise has variance 1 after whitening, to which the disturbance adds its own variance.
-        whitening = noise.whitening[cubes]
-        white_disturbance = whitening @ self.disturbance[:, :, None]
-        white_disturbance = white_disturbance[:, :, 0]
-        disturbance_variance = (white_disturbance**2).mean(axis=1)
-        total_variance = 1 + disturbance_variance
-        weight = 1 / np.sqrt(total_variance)
+        whitening = noise.whitening.take(cubes, axis=0)
+        white_disturbance = (whitening @ self.disturbance[:, :, None])[:, :, 0]
+        square = np.einsum("nc,nc->n", white_disturbance, white_disturbance)
+        disturbance_variance = square / white_disturbance.shape[1]
+        weight = 1 / np.sqrt(1 + disturbance_variance)
         self.whitening = whitening * weight[:, None, None]
 
     def find_nearest_cubes(self, places: Array) -> Index:
         """Return the indices (J,) of the cubes nearest to places (J, 2) on the skin laid flat."""
         offset = places[:, None] - self.place
-        squared_distance = (offset**2).sum(axis=2)
+        squared_distance = np.einsum("jnk,jnk->jn", offset, offset)
         nearest = squared_distance.argmin(axis=1)
         return np.asarray(self.cubes[nearest])
 
@@ -242,8 +233,8 @@ class LocalValues:
         limit = MAX_NOISE_CHANGE * smaller + _MIN_DISTURBANCE
         if larger > limit:
             return True
-        versions = self._noise.version[self.cubes]
-        return not np.array_equal(self._versions, versions)
+        versions = self._noise.version.take(self.cubes)
+        return bool((self._versions != versions).any())
 
     def refresh_if_stale(self) -> None:
         """Refresh if the noise of the cubes or the disturbance has changed."""
@@ -263,10 +254,10 @@ class LocalValues:
             scaled: Values (cubes of the skin, C) in Pa. Unknown values give 0.
             others: Response (n, C) in Pa to other contacts, which is subtracted.
         """
-        unexplained = scaled[self.cubes] - others
+        unexplained = scaled.take(self.cubes, axis=0) - others
         values = np.where(self.known, unexplained, 0.0)
         white = self.whitening @ values[:, :, None]
-        return np.asarray(white.ravel())
+        return white.ravel()
 
     def respond(self, centres: Array, size: float) -> Array:
         """Compute the response of the cubes to Hertz contacts with a force of 1 N.

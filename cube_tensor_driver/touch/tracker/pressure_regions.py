@@ -68,7 +68,7 @@ class PressureRegions:
         self,
         pressure: Array,
         certain: Array | None = None,
-    ) -> list[Index]:
+    ) -> list[tuple[Index, float]]:
         """Find the regions in the newest scan.
 
         Args:
@@ -77,7 +77,8 @@ class PressureRegions:
                 because errors of the values may cause smaller pressures; None: 0 at all points.
 
         Returns:
-            Indices of the points of each region, the region with the largest pressure first.
+            Indices of the points of each region and their largest pressure in Pa, the region with
+            the largest pressure first.
         """
         largest = float(pressure.max(initial=0.0))
         smallest = max(self._min_pressure, DETECTION_FRACTION * largest)
@@ -88,10 +89,9 @@ class PressureRegions:
         self._inside = pressure > limits
         if not np.array_equal(self._inside, before):
             self._regions = self._connect_points()
-        return sorted(
-            self._regions,
-            key=lambda region: -float(pressure[region].max()),
-        )
+        peaks = [float(pressure.take(region).max()) for region in self._regions]
+        found = zip(self._regions, peaks, strict=True)
+        return sorted(found, key=lambda pair: -pair[1])
 
     def find_around(self, points: Index) -> Index:
         """Return the indices of some points, and of all points within `JOIN_PITCHES` of them."""
@@ -105,7 +105,7 @@ class PressureRegions:
         regions = []
         for label in np.unique(wide):
             own = inside[wide == label]
-            cubes = np.unique(self._cube[own])
+            cubes = set(self._cube[own].tolist())
             if len(cubes) <= MAX_JOINED_CUBES:
                 regions.append(own)
                 continue

@@ -310,12 +310,16 @@ class TrackedRegion:
         """Index of the cube in whose frame `estimate_contacts` states the contacts."""
         return self.home if self.fit is None else self.fit.values.home
 
-    def estimate_contacts(self) -> list[ContactEstimate]:
-        """Return force, position, moment and area of each contact of the region."""
+    def estimate_contacts(self, is_refined: bool) -> list[ContactEstimate]:
+        """Return force, position, moment and area of each contact of the region.
+
+        Args:
+            is_refined: Whether the region `is_refined`.
+        """
         if self.fit is None:
             return [self.integral]
         contacts = self.fit.estimate_contacts()
-        if self.is_refined:
+        if is_refined:
             return contacts
         place_variance = (COARSE_DEVIATION * self._inverse.pitch) ** 2
         coarse = []
@@ -462,7 +466,7 @@ class TrackedRegion:
             self._responded = home, discs
         if self.fit is not None:
             self._responding[self.fit.values.cubes] = True
-        return cubes[~self._responding[cubes]]
+        return cubes[~self._responding.take(cubes)]
 
     def take_response(self, cubes: Index, response: Array) -> None:
         """Store the newest response of some cubes to this region.
@@ -595,11 +599,7 @@ class TrackedRegion:
         self._is_hertz_due = False
         self.waited = 0
         values = self._collect(home, self._inverse.near[home])
-        self.subtract_others(
-            values,
-            total[values.cubes],
-            deviation[values.cubes],
-        )
+        self.subtract_others(values, total, deviation)
         values.refresh()
         return HertzFit(self._inverse, values, self._start), self._whiten(values)
 
@@ -627,20 +627,24 @@ class TrackedRegion:
         values: LocalValues,
         total: Array,
         deviation: Array,
-    ) -> None:
-        """Set `others`, the response to all other regions.
+    ) -> Array:
+        """Set and return `others`, the response to all other regions.
 
         The fit of this region subtracts it from the C measured components of each of its cubes.
 
         Args:
             values: Cubes of the fit. Its attribute `disturbance` is set to the standard deviation
                 of `others`.
-            total: Response (n, C), in Pa, of these cubes to all regions, this one included.
-            deviation: Standard deviation (n, C) of this response, in Pa.
+            total: Response (cubes, C), in Pa, of all cubes to all regions, this one included. It
+                need only be set for the cubes of the fit.
+            deviation: Standard deviation (cubes, C) of this response, in Pa.
         """
-        own = self.response[values.cubes]
-        self.others = total - own
-        values.disturbance = deviation - self.relative_error * np.abs(own)
+        cubes = values.cubes
+        own = self.response.take(cubes, axis=0)
+        self.others = total.take(cubes, axis=0) - own
+        own_deviation = self.relative_error * np.abs(own)
+        values.disturbance = deviation.take(cubes, axis=0) - own_deviation
+        return self.others
 
     def _prepare_grid(self) -> None:
         """Prepare a fit of the traction by grid contacts (small contacts on a grid).
