@@ -117,7 +117,7 @@ class CubeMeasurement:
         """
         # Cubes in which the same pads are left out share a variant, so there are few to compare.
         matrix = components * self._unit_factors
-        is_equal = self.matrices == matrix
+        is_equal = np.isclose(self.matrices, matrix)
         equal = np.flatnonzero(is_equal.all(axis=(1, 2)))
         if len(equal):
             return int(equal[0])

@@ -9,6 +9,7 @@ posterior of t, prediction.py replaces values that are missing.
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -215,7 +216,9 @@ class SurfaceInverse:
             raise ElasticError(f"{side} points a side of a patch; it must be at least 1")
         n = len(poses.position)
         self.revision = 0
-        self._unrolled: dict[int, tuple[Array, Array]] = {}
+        # The whole skin is laid flat at once and kept, because contacts stay at few cubes.
+        everything = np.arange(n)[None]
+        self._unroll_skin = cache(lambda centre: unroll(poses, np.array([centre]), everything))
         self.poses = poses
         self.depth = depth
         self.pitch = poses.pitch
@@ -240,8 +243,7 @@ class SurfaceInverse:
         # comparable.
         is_stress = self.columns < len(STRESS)
         self._unit_factors = np.where(is_stress, 1.0, scale)
-        self._all_pads = by_pad[:, self.columns] * self._unit_factors[:, None]
-        self.by_pad = self._all_pads.copy()
+        self.by_pad = by_pad[:, self.columns] * self._unit_factors[:, None]
 
         # A cube gets another variant in the measurement model while some of its pads are left out.
         self._model = model
@@ -292,14 +294,8 @@ class SurfaceInverse:
             Positions (n, 2) in m and rotations (n,) about z in rad of these cubes, in the frame of
             the centre cube.
         """
-        # The whole skin is laid flat at once and kept, because contacts stay at few cubes.
-        if centre not in self._unrolled:
-            everything = np.arange(len(self.poses.position))
-            centres = np.array([centre])
-            places, angles = unroll(self.poses, centres, everything[None])
-            self._unrolled[centre] = places[0], angles[0]
-        place, angle = self._unrolled[centre]
-        return place[cubes], angle[cubes]
+        place, angle = self._unroll_skin(centre)
+        return place[0, cubes], angle[0, cubes]
 
     def leave_out(self, cubes: Index, by_pad: Array) -> None:
         """Change the pads that cubes use, for example because some pads are broken.
@@ -321,7 +317,7 @@ class SurfaceInverse:
         for cube, own in zip(cubes.tolist(), by_pad, strict=True):
             pads = self._model.pads[self._model.variant[cube]]
             self.variant[cube] = self._cubes.add_variant(pads @ np.nan_to_num(own).T)
-        has_all_pads = np.isclose(self.by_pad, self._all_pads, equal_nan=True).all(axis=(1, 2))
+        has_all_pads = self.variant == self._model.variant
         self._usable = self.observed & has_all_pads[:, None]
 
     def state_errors(self, errors: Array | None) -> None:

@@ -14,6 +14,7 @@ Force and position of a contact follow from the equilibrium of the layer above t
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -156,11 +157,10 @@ class Surface:
 
         near = find_nearest_cubes(poses, NEIGHBOURS)
         length = LENGTH_PER_DEPTH * depth
-        pressure = PRESSURE if gradients else PRESSURE[:1]
-        self._zz, self._zz_alone, *self._shear = (
-            Interpolation(poses, near, self._patches, length, columns)
-            for columns in (pressure, PRESSURE[:1], *([column] for column in SHEAR))
-        )
+        interpolate = partial(Interpolation, poses, near, self._patches, length)
+        self._zz = interpolate(PRESSURE if gradients else PRESSURE[:1])
+        self._zz_alone = interpolate(PRESSURE[:1])
+        self._shear = [interpolate([column]) for column in SHEAR]
         # `_pairs` (pairs, 2) are the indices of neighbouring points. A distance of 1.5 times the
         # spacing includes diagonal neighbours.
         tree = cKDTree(self.points)
@@ -221,15 +221,18 @@ class Surface:
         if not inside.any():
             return []
 
-        loaded = _LoadedSurface(
-            pressure=pressure,
-            shear=np.nan_to_num([one.interpolate(values) for one in self._shear]),
-            moment_pressure=np.nan_to_num(-self._zz_alone.interpolate(values)),
-            uncertainty=self._zz.compute_uncertainty(values),
-            sees_shear=bool(np.isfinite(values[:, SHEAR]).any()),
-        )
+        shear = np.nan_to_num([one.interpolate(values) for one in self._shear])
+        shear = np.einsum("cnq,nic->nqi", shear, self.poses.rotation[:, :, :2])
+        moment_pressure = np.nan_to_num(-self._zz_alone.interpolate(values))
+        uncertainty = self._zz.compute_uncertainty(values)
+        on_patches = pressure, moment_pressure, shear, uncertainty
         owner = self._assign_patches(inside)
-        contacts = [self._make_contact(loaded, owner == number) for number in np.unique(owner)]
+        contacts = []
+        for number in np.unique(owner):
+            chosen = owner == number
+            contacts.append(self._make_contact(chosen, *(one[chosen] for one in on_patches)))
+        if not np.isfinite(values[:, SHEAR]).any():
+            contacts = [contact._replace(shear_force=np.nan) for contact in contacts]
         return sorted(contacts, key=lambda contact: -contact.normal_force)
 
     def _assign_patches(self, inside: Mask) -> Index:
@@ -256,38 +259,45 @@ class Surface:
         _, nearest = cKDTree(position[is_touched]).query(position)
         return np.asarray(component[is_touched][nearest], np.intp)
 
-    def _make_contact(self, loaded: _LoadedSurface, chosen: Mask) -> Contact:
+    def _make_contact(
+        self,
+        chosen: Mask,
+        pressure: Array,
+        moment_pressure: Array,
+        shear: Array,
+        uncertainty: Array,
+    ) -> Contact:
         """Compute force, position and uncertainty of a contact.
 
         A patch is a square grid of points above one cube; the patches of all cubes cover the skin.
 
         Args:
-            loaded: Pressure and shear in Pa at the points of all patches.
-            chosen: Whether the patch of each cube (cubes,) belongs to the contact.
+            chosen: Whether the patch of each cube (cubes,) is one of the n patches of the contact.
+            pressure: Pressure (n, points) in Pa, interpolated from values and gradients.
+            moment_pressure: Pressure (n, points) in Pa, interpolated from values alone, as the
+                shear is.
+            shear: Shear stress (n, points, 3) in Pa, in the skin's parent frame.
+            uncertainty: Relative standard deviation (n, points) of the pressure, 0 to 1.
         """
-        rotation = self.poses.rotation[chosen]
         points = self._patches[chosen]
-        pressure = loaded.pressure[chosen]
-        weight = loaded.moment_pressure[chosen] * self.area
+        weight = moment_pressure * self.area
         normal_force = float(pressure.sum() * self.area)
-        # The sums are einsums, because matrix products of BLAS would start threads that occupy a
-        # second core. The normal of the contact is the mean of its cubes' normals, weighted with
-        # the pressure.
-        normal = np.einsum("n,ni->i", pressure.sum(axis=1), rotation[:, :, 2])
+        # The normal of the contact is the mean of its cubes' normals, weighted with the pressure.
+        # This sum is an einsum, because a matrix product of BLAS would start threads that occupy a
+        # second core.
+        cube_normals = self.poses.rotation[chosen, :, 2]
+        normal = np.einsum("n,ni->i", pressure.sum(axis=1), cube_normals)
         normal /= np.linalg.norm(normal)
-
-        in_plane = rotation[:, :, :2]
-        by_patch = loaded.shear[:, chosen].sum(axis=2) * self.area
-        shear = np.einsum("cn,nic->i", by_patch, in_plane)
-        shear -= normal * (shear @ normal)
+        tangential = shear.sum(axis=(0, 1)) * self.area
+        tangential -= normal * (tangential @ normal)
         # The shear force acts on the surface, `depth` above the cubes' plane, and so shifts the
         # centre of pressure in this plane by depth × shear force / normal force.
         centre = np.einsum("nq,nqi->i", weight, points) / weight.sum()
-        position = centre + self.depth * (normal - shear / weight.sum())
+        position = centre + self.depth * (normal - tangential / weight.sum())
 
         # Interpolation errors are correlated over one pitch (distance of neighbouring cubes), so
         # the errors of the pitch / spacing points along each axis add up instead of averaging out.
-        pressure_deviation = loaded.uncertainty[chosen] * pressure
+        pressure_deviation = uncertainty * pressure
         variance = (pressure_deviation * self.pitch * self.spacing) ** 2
         # The lever lies in the surface. Along one axis, its mean square is half of its square.
         squared_lever = ((points - centre) ** 2).sum(axis=2) / 2
@@ -296,33 +306,13 @@ class Surface:
         return Contact(
             position=position,
             normal=normal,
-            force=shear - normal * normal_force,
+            force=tangential - normal * normal_force,
             normal_force=normal_force,
-            shear_force=float(np.linalg.norm(shear)) if loaded.sees_shear else np.nan,
+            shear_force=float(np.linalg.norm(tangential)),
             area=n_pressed * self.area,
             position_uncertainty=float(moment_deviation / normal_force),
             force_uncertainty=float(np.sqrt(variance.sum())),
         )
-
-
-class _LoadedSurface(NamedTuple):
-    """Quantities at the points of all patches from which contacts are computed.
-
-    Attributes:
-        pressure: Pressure (cubes, points) in Pa, interpolated from values and gradients.
-        shear: Shear stresses σzx and σyz (2, cubes, points) in Pa.
-        moment_pressure: Pressure (cubes, points) in Pa, interpolated from values alone, as the
-            shear is.
-        uncertainty: Relative standard deviation (cubes, points) of the pressure, 0 to 1, as from
-            `Surface.compute_uncertainty`.
-        sees_shear: Whether some cube observes shear.
-    """
-
-    pressure: Array
-    shear: Array
-    moment_pressure: Array
-    uncertainty: Array
-    sees_shear: bool
 
 
 def make_square_points(spacing: float, side: int) -> Array:
