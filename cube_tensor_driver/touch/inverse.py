@@ -275,7 +275,7 @@ class SurfaceInverse:
             The C components `columns` (cubes, C) in Pa; gradients are multiplied by half the side
             of a cube.
         """
-        return np.asarray(values)[:, self.columns] * self._unit_factors
+        return self.select(np.asarray(values)) * self._unit_factors
 
     def select(self, components: Array) -> Array:
         """Return the C components `columns` (..., C) of all 15 (..., 15), without a copy if all."""

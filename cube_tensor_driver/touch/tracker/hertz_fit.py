@@ -378,9 +378,10 @@ class HertzFit:
         jacobian = self.linear.jacobian.reshape(*self.values.known.shape, -1)
         jacobian = jacobian[rows, :, :n_parameters].reshape(-1, n_parameters)
         information = jacobian.T @ jacobian + np.diag(self.contact_precision)
-        solved = np.linalg.solve(information, jacobian.T)[:5].reshape(5, *whitening.shape[:2])
+        by_value = jacobian @ np.linalg.inv(information)[:, :5]
+        by_cube = by_value.reshape(*whitening.shape[:2], 5).swapaxes(1, 2) @ whitening
         weights = np.zeros((5, len(cubes), whitening.shape[2]))
-        weights[:, columns] = np.einsum("knc,ncd->knd", solved, whitening)
+        weights[:, columns] = by_cube.swapaxes(0, 1)
         return weights
 
     def _move_contacts(self, change: Array) -> None:
