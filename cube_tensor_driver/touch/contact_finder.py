@@ -280,8 +280,7 @@ class _InverseFinder:
         else:
             certain = CERTAIN_DEVIATIONS * self._inverse.error_deviation
         self.contacts = self._tracker.update(values, certain)
-        self._slip.adopt(self.contacts, values, self._tracker.single_fits)
-        self._slip.update(time_s, values)
+        self._slip.update(time_s, values, self.contacts, self._tracker.single_fits)
         self.touch_id = self._links.link(self.contacts, touches)
 
     def follow(self, time_s: float, values: Array) -> bool:

@@ -34,13 +34,15 @@ Source: K. L. Johnson, Contact Mechanics (1985), 7.1 (sliding) and 7.2 (partial 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
-from ..core.arrays import Array, Index, Mask, Records
+from ..core.arrays import Array, Index, Mask
 from .inverse import SurfaceInverse
 from .tracker.contact_estimate import Discs
 from .tracker.contact_tracker import TrackedContact
@@ -55,17 +57,16 @@ STICK = 1
 SLIP = 2
 """State of a contact whose whole area slides over the skin (gross slip)."""
 
-Field = tuple[str, type, tuple[int, ...]]
-"""Name, type of the values and shape of a field of a structured array."""
-
 N_CUBES = 16
 """Number of cubes nearest to a contact from whose values its force and position are computed in
 every scan."""
 
 LAGS = np.array([2, 4, 8, 16, 32, 64])
-"""Durations, in scans (sets of values of all cubes), over which the motion of a contact is
-tested. The short ones find fast slip early; the long ones find slow slip, whose motion the noise
-hides over a short time."""
+"""Durations, in scans, over which the motion of a contact is tested. The short ones find fast slip
+early; the long ones find slow slip, whose motion the noise hides over a short time."""
+
+N_SCANS = int(LAGS[-1]) + 1
+"""Number of scans whose motion states are stored: the newest one and those before it for `LAGS`."""
 
 MIN_DISTANCE_M = 10e-6
 """Smallest motion in m that counts as slip; the noise of the position is 0.3 to 3 um for loads of
@@ -103,15 +104,12 @@ of this contact so far. Friction has held the largest ratio, and the coefficient
 is rarely less than half of the static one."""
 
 MAX_RATIO_CHANGE = 0.2
-"""Largest change of the ratio of shear and normal force of a contact that slips, divided by the
-ratio. The change is taken over the same duration (`LAGS`) as the motion that shows the slip."""
+"""Largest change of the ratio of shear and normal force of a contact that slips, over the duration
+(`LAGS`) of the motion that shows the slip, divided by the ratio."""
 
 MIN_COSINE = 0.8
-"""Smallest cosine of the angle between motion and shear force of a contact that slips.
-
-A body that slides pulls the skin along its motion. One that moves across its shear force rolls or
-tilts.
-"""
+"""Smallest cosine of the angle between motion and shear force of a contact that slips. A body that
+moves across its shear force rolls or tilts."""
 
 MIN_LATE_SHARE = 0.25
 """Smallest fraction of a contact's motion, during one of the durations `LAGS`, that must fall into
@@ -122,66 +120,62 @@ MIN_FORCE_N = 0.05
 state is `UNKNOWN` unless slip is detected."""
 
 FOLLOWED_DEVIATION = 0.02
-"""Relative standard deviation that is assumed for the ratio of shear and normal force between two
-updates of the contact tracker, when the ratio is computed from changes of the cubes' values since
-the last update. The relative error of the ratio was 1.6 % (rms) in simulations of 24-pad cubes, for
-contacts that had moved by up to some millimetres since this update."""
+"""Relative standard deviation of the ratio of shear and normal force that is computed from changes
+of the cubes' values since the last fit of the contact tracker. It was 1.6 % (rms) in simulations of
+24-pad cubes, for contacts that had moved by up to some millimetres since this fit."""
 
 MAX_SHIFT_DEPTHS = 0.2
-"""Shift of a contact, divided by the depth of the cubes' centres below the surface, after which the
-derivatives of the cubes' values by the contact's force and position are computed again. The shift
-is counted from where the present derivatives hold. `MIN_SHIFT_DEPTHS` must be exceeded, too."""
+"""Shift of a contact from where it was linearised, divided by the depth of the cubes' centres below
+the surface, after which it is linearised again: the derivatives of the cubes' values by its force
+and position are computed again."""
 
 MIN_SHIFT_DEPTHS = 0.1
 """Shift of a contact since the last fit of the contact tracker, divided by the depth of the cubes'
-centres, up to which the derivatives of the cubes' values by the contact's force and position need
-not be exact: only this small shift is computed with them. `MAX_SHIFT_DEPTHS` does not apply then.
-"""
+centres, up to which the derivatives need not be exact, because only this small shift is computed
+with them. `MAX_FITTED_SHIFT_DEPTHS` then replaces `MAX_SHIFT_DEPTHS`."""
 
 MAX_FITTED_SHIFT_DEPTHS = 0.5
-"""Shift of a contact, divided by the depth of the cubes' centres, after which the derivatives of
-the cubes' values by the contact's force and position are computed again, even if the contact
-tracker has just fitted the contact (`MIN_SHIFT_DEPTHS`)."""
+"""Shift of a contact that the contact tracker has just fitted (`MIN_SHIFT_DEPTHS`) after which it
+is linearised again, measured as in `MAX_SHIFT_DEPTHS`."""
 
 MAX_FORCE_CHANGE = 0.3
-"""Change of the force of a contact, divided by the force, after which the derivatives of the cubes'
-values by the contact's force and position are computed again, because the radius of the contact
-changes with the force."""
+"""Change of the force of a contact, divided by the force, after which it is linearised again,
+because the radius of the contact changes with the force."""
 
 MAX_JUMP = 0.6
-"""Change of the force of a contact since the derivatives of the cubes' values by its force and
-position were computed, divided by the force, above which the motion of the contact is unknown.
-Because the derivatives are computed again above `MAX_FORCE_CHANGE`, only a sudden change, as of a
-body that bounces, exceeds this limit. Linear extrapolation then gives no useful position."""
+"""Change of the force of a contact since it was linearised, divided by the force, above which its
+motion is unknown. Because of `MAX_FORCE_CHANGE`, only a sudden change, as of a body that bounces,
+exceeds this limit. Linear extrapolation then gives no useful position."""
 
 MAX_LINEARISATIONS = 2
-"""Largest number of contacts per scan (set of values of all cubes) for which the derivatives of the
-cubes' values by force and position are computed. Each contact takes about 1 ms."""
+"""Largest number of contacts that are linearised in one scan. Each takes up to 1 ms."""
 
 NEIGHBOUR_PITCHES = 3.0
 """Distance of two contacts, divided by the pitch (distance of neighbouring cubes), below which
 changes of the cubes' values are attributed to changes of both contacts."""
 
-
 MAX_NORMAL_CHANGE = 0.05
-"""Largest change of the normal force of a contact during the fit of `Slip.partial` (measure of
-partial slip), divided by the force; after a larger change, the fit starts again. The fit includes a
-term for the normal force, so that changes of 2 % did not change the result."""
+"""Change of the normal force of a contact, divided by the force, after which the fit of
+`Slip.partial` starts again. The fit includes a term for the normal force, so that changes of 2 %
+did not change the result."""
 
 MAX_SHIFT_M = 2e-4
-"""Largest motion of a contact, in m, during the fit of `Slip.partial` (measure of partial slip);
-after a larger motion, the fit starts again. Motion changes the stresses like partial slip, by as
-much if it is 1 mm. A motion of 0.1 mm gave values up to 0.05 in simulations of flat punches, which
-have no partial slip."""
+"""Motion of a contact in m after which the fit of `Slip.partial` starts again. Motion changes the
+stresses like partial slip, by as much if it is 1 mm. A motion of 0.1 mm gave values up to 0.05 in
+simulations of flat punches, which have no partial slip."""
 
 PARTIAL_DEVIATION = 0.01
-"""Largest standard deviation of `Slip.partial` (measure of partial slip) due to the noise of the
-pads. If it is larger, as it is while the shear force has changed little, the measure is unknown
-(NaN)."""
+"""Largest standard deviation of `Slip.partial` due to the noise of the pads. If it is larger, as it
+is while the shear force has changed little, `Slip.partial` is unknown (NaN)."""
 
+_NEWEST = 0
+"""Index of the newest linearisation of a contact."""
 
-NO_FITS: Mapping[int, HertzFit] = MappingProxyType({})
-"""Fits by the ids of their contacts if none are known."""
+_FIRST = 1
+"""Index of the linearisation with which the fit of `Slip.partial` has begun."""
+
+_SHEAR_TERMS = np.repeat([[0, 0, 1, 1], [0, 0, 0, 1]], [1, 1, 3, 3], axis=1)
+"""Masks (2, 8) of the terms 1, n, q and |q| q: those of the shear force, and the last one."""
 
 
 class Slip(NamedTuple):
@@ -220,12 +214,94 @@ NO_CONTACTS = Slip(
 """State and friction if nothing presses on the skin: empty arrays."""
 
 
+@dataclass
+class _Contacts:
+    """The n contacts that the tracker has found last. The first axis of each array counts them.
+
+    V values of the cubes near a contact determine its load: force (3) in N and position (3) in m.
+    The second axis (2) of `cubes`, `weights`, `values` and `pad_variance` stands for two
+    linearisations: the newest one (`_NEWEST`), and that with which the fit of `Slip.partial` has
+    begun (`_FIRST`). The latter is used for the whole fit, because other weights would give another
+    shear force even for the same values.
+
+    Attributes:
+        normal: Unit normals (n, 3) out of the skin.
+        ratio_deviation: Standard deviations s (n,) of the ratio of shear and normal force.
+        largest_ratio: Largest ratios (n,) that are certain.
+        slips: Whether each contact slips (n,).
+        is_fitted: Whether `sums` contain ratios of loads that the tracker has found (n,).
+        sums: Sums (n, 3) of 1 / s, 1 / s^2 and ratio / s^2 over the scans in which a contact slips.
+        cubes: Indices (n, 2, cubes) of the nearest cubes.
+        weights: Derivatives (n, 2, 6, V) of the load by the values in Pa.
+        values: Values (n, 2, V) in Pa from which changes are counted.
+        pad_variance: Variances (n, 2) of the noise of all V values together in Pa^2.
+        noise: Standard deviations (n,) of the position in m; 0 before the first linearisation.
+        load: Loads (n, 6) at the newest `values`.
+        linearised: Loads (n, 6) for which the newest `weights` were computed.
+        past: Motion states (n, scans, 7) of the last scans, from `_compute_motion_states`.
+        terms: Terms (n, 8) of the fit of `Slip.partial` in the newest scan: 1, n, q and |q| q.
+        equations: Normal equations (n, 8, 8 + V) of this fit: sums over its scans of the products
+            of the terms with the terms and with the changes of the values.
+        partial: Results (n,) of this fit.
+    """
+
+    normal: Array
+    ratio_deviation: Array
+    largest_ratio: Array
+    slips: Mask
+    is_fitted: Mask
+    sums: Array
+    cubes: Index
+    weights: Array
+    values: Array
+    pad_variance: Array
+    noise: Array
+    load: Array
+    linearised: Array
+    past: Array
+    terms: Array
+    equations: Array
+    partial: Array
+
+    @classmethod
+    def make_new(cls, n_cubes: int, n_values: int) -> _Contacts:
+        """Return one contact of which nothing is known."""
+
+        def zeros(*shape: int) -> Array:
+            return np.zeros((1, *shape))
+
+        return cls(
+            normal=zeros(3),
+            ratio_deviation=zeros(),
+            largest_ratio=zeros(),
+            slips=zeros() > 0,
+            is_fitted=zeros() > 0,
+            sums=zeros(3),
+            cubes=zeros(2, n_cubes).astype(np.intp),
+            weights=zeros(2, 6, n_values),
+            values=zeros(2, n_values),
+            pad_variance=zeros(2),
+            noise=zeros(),
+            load=zeros(6),
+            linearised=zeros(6),
+            past=zeros(N_SCANS, 7) + np.nan,
+            terms=zeros(8),
+            equations=zeros(8, 8 + n_values),
+            partial=zeros(),
+        )
+
+    def select(self, numbers: list[int], new: _Contacts) -> _Contacts:
+        """Return the contacts with these numbers; the number -1 stands for the contact `new`."""
+        pairs = zip(vars(self).values(), vars(new).values(), strict=True)
+        return _Contacts(*(np.concatenate(pair)[numbers] for pair in pairs))
+
+
 class SlipEstimator:
     """Estimates in every scan whether the contacts that the contact tracker has found slip.
 
     Attributes:
-        slip: State and friction of the contacts in the newest scan, in the order of the contacts
-            in the last call of `adopt`.
+        slip: State and friction of the contacts in the newest scan, in the order in which the
+            tracker has found them.
     """
 
     def __init__(self, inverse: SurfaceInverse) -> None:
@@ -237,373 +313,306 @@ class SlipEstimator:
         self._inverse = inverse
         self._noise = CubeNoise(inverse)
         poses = inverse.poses
-        normals = poses.rotation[:, :, 2]
-        self._above_cubes = poses.position + inverse.depth * normals
-
-        count = min(N_CUBES, len(self._above_cubes))
-        n_values = count * len(inverse.columns)
-        n_scans = LAGS[-1] + 1
-        # The following are the fields of one contact. A load is force (3) in N and position (3) in
-        # m. The matrix `weights` converts changes of the cubes' values, in Pa, to changes of it.
-        linear: list[Field] = [
-            ("cubes", int, (count,)),
-            ("weights", float, (6, n_values)),
-            ("values", float, (n_values,)),
-        ]
-        fields: list[tuple[str, type | list[Field], tuple[int, ...]]] = [
-            ("id", int, ()),
-            ("normal", float, (3,)),
-            ("radius", float, ()),
-            ("ratio_deviation", float, ()),
-            ("largest_ratio", float, ()),
-            ("slips", bool, ()),
-            ("is_fitted", bool, ()),
-            # Sums over the scans in which the contact slipped, for the weighted mean of the ratios
-            # of shear and normal force, which is the friction coefficient (`_add_ratio`).
-            ("sums", float, (3,)),
-            *linear,
-            # Standard deviation of the position, in m.
-            ("noise", float, ()),
-            # Load at `values`, and load for which `weights` was computed.
-            ("load", float, (6,)),
-            ("linearised", float, (6,)),
-            # Motion states (`_compute_motion_states`) in the last scans, newest first.
-            ("past", float, (n_scans, 7)),
-            # Least-squares fit of the cubes' values that shows partial slip (head of this file):
-            # cubes, weights and values in its first scan, its result `Slip.partial`, and its terms
-            # in the newest scan (1, n, q and |q| q).
-            ("first", linear, ()),
-            ("partial", float, ()),
-            ("terms", float, (8,)),
-            # Normal equations of this fit, summed over its scans: products of the terms with each
-            # other, and of the terms with the changes of the values.
-            ("gram", float, (8, 8)),
-            ("moments", float, (8, n_values)),
-        ]
-        self._contacts: Records = np.zeros(0, fields)
-        self._times = np.full(n_scans, -np.inf)
-        self._fits = NO_FITS
+        self._normals = poses.rotation[:, :, 2]
+        self._above_cubes = poses.position + inverse.depth * self._normals
+        n_cubes = min(N_CUBES, len(self._above_cubes))
+        self._new = _Contacts.make_new(n_cubes, n_cubes * len(inverse.columns))
+        self._contacts = self._new.select([], self._new)
+        self._found: Sequence[TrackedContact] = ()
+        # `past` and `_times` are ring buffers, in which the newest scan has the index `_place`.
+        self._times = np.full(N_SCANS, -np.inf)
+        self._place = 0
         self.slip = NO_CONTACTS
 
-    def adopt(
+    def update(
         self,
-        found: Sequence[TrackedContact],
+        time_s: float,
         values: Array,
-        fits: Mapping[int, HertzFit] = NO_FITS,
-    ) -> None:
-        """Take over the contacts that the tracker has found; call `update` afterwards.
-
-        Args:
-            found: The contacts.
-            values: Components (cubes, 15) in Pa and Pa/m in which they were found.
-            fits: `ContactTracker.single_fits`, whose derivatives need not be computed again.
-        """
-        self._fits = fits
-        scaled = self._inverse.scale_values(values)
-        ids = self._contacts["id"].tolist()
-        contacts = np.zeros(len(found), self._contacts.dtype)
-        contacts["past"] = np.nan
-        for number, one in enumerate(found):
-            if one.id in ids:
-                old_number = ids.index(one.id)
-                contacts[number] = self._contacts[old_number]
-            ratio = one.shear_force / one.normal_force
-            by_normal_force = ratio * one.force_uncertainty
-            shear_deviation = np.hypot(by_normal_force, one.shear_uncertainty)
-            ratio_deviation = shear_deviation / one.normal_force
-            certain_ratio = ratio - 3 * ratio_deviation
-            row = contacts[number]
-            row["id"] = one.id
-            row["normal"] = one.normal
-            row["radius"] = np.sqrt(one.area / np.pi)
-            row["ratio_deviation"] = ratio_deviation
-            row["largest_ratio"] = max(row["largest_ratio"], certain_ratio)
-        self._contacts = contacts
-        if not found:
-            self.slip = NO_CONTACTS
-            return
-
-        contacts["partial"] = np.nan
-        # Eight coefficients need as many scans. A contact that moves begins again in every scan.
-        is_determined = contacts["gram"][:, 0, 0] >= 8
-        if is_determined.any():
-            contacts["partial"] = np.where(
-                is_determined,
-                self._estimate_partial_slip(),
-                np.nan,
-            )
-        normal = contacts["normal"]
-        followed = self._follow(scaled)
-        before = _compute_motion_states(followed, normal)
-        contacts["load"] = [[*one.force, *one.position] for one in found]
-        contacts["values"] = self._gather(scaled)
-        after = _compute_motion_states(contacts["load"], normal)
-        # The tracker has fitted the loads again. This corrects the errors of the loads that were
-        # computed from changes of the values since its last fit. The past states get the same
-        # correction, so that it does not look like motion.
-        correction = after - before
-        contacts["past"] += correction[:, None]
-
-        # The friction coefficient is a mean of force ratios during slip. When the tracker fits a
-        # contact for the first time while it slips, earlier ratios are dropped, because they were
-        # only computed from changes of the values.
-        slips = contacts["slips"]
-        is_new = slips & ~contacts["is_fitted"]
-        contacts["sums"][is_new] = 0.0
-        contacts["is_fitted"] |= slips
-        shear_ratio = after[:, 3:6]
-        ratios = _compute_lengths(shear_ratio)
-        _add_ratio(
-            contacts,
-            slips,
-            ratios,
-            contacts["ratio_deviation"],
-        )
-
-    def update(self, time_s: float, values: Array) -> bool:
+        found: Sequence[TrackedContact] | None = None,
+        fits: Mapping[int, HertzFit] = MappingProxyType({}),
+    ) -> bool:
         """Estimate `slip` from the values of a scan.
 
         Args:
             time_s: Time of the scan in s. If it equals the time of the previous call, `values` must
                 be those of the previous call, too.
             values: Components (cubes, 15) in Pa and Pa/m, NaN where unknown.
+            found: Contacts that the tracker has found in these values. None: it has not looked for
+                them in this scan, and the contacts are the same as in the previous call.
+            fits: `ContactTracker.single_fits`, whose derivatives need not be computed again.
 
         Returns:
             Whether a contact has begun to slip.
         """
+        if found is None:
+            fits = {}  # Fits in an earlier scan hold for other positions.
+        else:
+            self._match(found)
         contacts = self._contacts
-        if not len(contacts):
+        if not self._found:
+            self.slip = NO_CONTACTS
             return False
         scaled = self._inverse.scale_values(values)
-        loads = self._follow(scaled)
-        self._linearise_changed(loads, scaled)
-        self._fits = NO_FITS  # later, the contacts are elsewhere
-        self._observe_shear(scaled)
-        newest = _compute_motion_states(loads, contacts["normal"])
+        near = scaled[contacts.cubes].reshape(contacts.values.shape)
+        change = near - contacts.values
+        change[np.isnan(change)] = 0.0  # A value that is missing counts as unchanged.
+        load_change = (contacts.weights @ change[..., None])[..., 0]
+        loads = contacts.load + load_change[:, _NEWEST]
+        if found is not None:
+            contacts.values[:, _NEWEST] = near[:, _NEWEST]
+            loads = self._correct(loads)
+        self._linearise_changed(loads, scaled, fits)
+        self._observe_shear(change[:, _FIRST], load_change[:, _FIRST])
+        newest = _compute_motion_states(loads, contacts.normal)
         self._remember(time_s, newest)
 
-        earlier = contacts["past"][:, LAGS]
-        change = newest[:, None] - earlier
-        duration = time_s - self._times[LAGS]
-        moves, slips = self._test_lags(newest, change, duration)
-        slipped = slips.any(axis=1)
-        begins = slipped & ~contacts["slips"]
-        contacts["slips"] = slipped
-
+        places = (self._place - LAGS) % N_SCANS
+        motion = newest[:, None] - contacts.past[:, places]
+        duration = time_s - self._times[places]
         shear_ratio = newest[:, 3:6]
         ratio = _compute_lengths(shear_ratio)
-        followed_deviation = FOLLOWED_DEVIATION * ratio
-        deviation = np.hypot(contacts["ratio_deviation"], followed_deviation)
-        is_followed = slipped & ~contacts["is_fitted"]
-        _add_ratio(contacts, is_followed, ratio, deviation)
+        moves, slips = self._test_lags(motion, duration, shear_ratio, ratio)
+        slipped: Mask = np.any(slips, axis=1)
+        begins = slipped & ~contacts.slips
+        contacts.slips = slipped
+        is_followed = slipped & ~contacts.is_fitted
+        deviation = np.hypot(contacts.ratio_deviation, FOLLOWED_DEVIATION * ratio)
+        self._add_ratios(is_followed, ratio, deviation)
+        inverse_sum, weight_sum, ratio_sum = contacts.sums.T
+        # The friction coefficient is NaN before the first slip of a contact.
+        divisor = np.where(weight_sum > 0, weight_sum, np.nan)
+        friction = ratio_sum / divisor
 
-        log_force = newest[:, 6]
-        is_strong = log_force > np.log(MIN_FORCE_N)
-        has_past = np.isfinite(change[:, 0, 0])
-        is_known = has_past & is_strong
-        sticks = is_known & ~moves.any(axis=1)
+        has_past = np.isfinite(motion[:, 0, 0])
+        is_strong = newest[:, 6] > np.log(MIN_FORCE_N)
+        sticks = has_past & is_strong & ~moves.any(axis=1)
         state = np.where(sticks, STICK, UNKNOWN)
         state[slipped] = SLIP
-
-        shortest = slips.argmax(axis=1)
-        each = np.arange(len(state))
-        moved = change[each, shortest, :3]
-        velocity = moved / duration[shortest, None]
-        velocity[state == STICK] = 0.0
+        velocity = np.zeros((len(state), 3))
         velocity[state == UNKNOWN] = np.nan
-
-        # Before the first slip of a contact all of its sums are 0, so that its friction coefficient
-        # becomes NaN.
-        with np.errstate(invalid="ignore"):
-            inverse_sum, weight_sum, ratio_sum = contacts["sums"].T
-            friction = ratio_sum / weight_sum
-            uncertainty = inverse_sum / weight_sum
+        for row in np.flatnonzero(slipped).tolist():
+            shortest = slips[row].argmax()
+            velocity[row] = motion[row, shortest, :3] / duration[shortest]
         self.slip = Slip(
             state=state,
             friction=friction,
-            friction_uncertainty=uncertainty,
+            friction_uncertainty=inverse_sum / divisor,
             friction_use=ratio / friction,
             velocity=velocity,
-            partial=np.where(sticks, contacts["partial"], np.nan),
+            partial=np.where(sticks, contacts.partial, np.nan),
         )
         return bool(begins.any())
 
-    def _observe_shear(self, scaled: Array) -> None:
-        """Add the values (cubes, C) of a scan, in Pa, to the fits of `Slip.partial`.
+    def _match(self, found: Sequence[TrackedContact]) -> None:
+        """Take over the contacts that the tracker has found, except for their loads."""
+        known = {one.id: number for number, one in enumerate(self._found)}
+        numbers = [known.get(one.id, -1) for one in found]
+        self._found = found
+        if numbers != list(range(len(known))):
+            self._contacts = self._contacts.select(numbers, self._new)
+        contacts = self._contacts
+        for row, one in enumerate(found):
+            ratio = one.shear_force / one.normal_force
+            by_normal_force = ratio * one.force_uncertainty
+            deviation = math.hypot(by_normal_force, one.shear_uncertainty) / one.normal_force
+            contacts.normal[row] = one.normal
+            contacts.ratio_deviation[row] = deviation
+            contacts.largest_ratio[row] = max(contacts.largest_ratio[row], ratio - 3 * deviation)
+        contacts.partial = self._estimate_partial_slip()
 
-        A fit starts again when the normal force or the position has changed, or the contact slips.
+    def _correct(self, followed: Array) -> Array:
+        """Take over and return the loads (n, 6) that the tracker has found.
+
+        Args:
+            followed: The loads in the same scan by the changes of the cubes' values.
         """
         contacts = self._contacts
-        # The weights of the first scan of a fit are used throughout, because other weights would
-        # give another shear force even for the same values.
-        first = contacts["first"]
-        values = scaled[first["cubes"]].reshape(len(contacts), -1)
-        change = np.nan_to_num(values - first["values"])
-        load = np.einsum("nkm,nm->nk", first["weights"], change)
-        normal = contacts["normal"]
-        outward = np.einsum("nk,nk->n", load[:, :3], normal)[:, None]
-        shear = load[:, :3] - outward * normal
-        curved = _compute_lengths(shear)[:, None] * shear
-        terms = np.hstack([np.ones_like(outward), outward, shear, curved])
-        contacts["terms"] = terms
-        contacts["gram"] += terms[:, :, None] * terms[:, None]
-        contacts["moments"] += terms[:, :, None] * change[:, None]
+        loads = np.array([[*one.force, *one.position] for one in self._found])
+        contacts.load = loads.copy()
+        # The tracker has fitted the loads again. This corrects the errors of `followed`. The past
+        # states get the same correction, so that it does not look like motion.
+        both = np.stack([followed, loads])
+        before, after = _compute_motion_states(both, contacts.normal)
+        contacts.past += (after - before)[:, None]
 
-        force = _compute_lengths(contacts["load"][:, :3])
+        # The friction coefficient is a mean of force ratios during slip. When the tracker fits a
+        # contact for the first time while it slips, earlier ratios are dropped, because they were
+        # only computed from changes of the values.
+        slips = contacts.slips
+        contacts.sums[slips & ~contacts.is_fitted] = 0.0
+        contacts.is_fitted |= slips
+        self._add_ratios(slips, _compute_lengths(after[:, 3:6]), contacts.ratio_deviation)
+        return loads
+
+    def _add_ratios(self, chosen: Mask, ratio: Array, deviation: Array) -> None:
+        """Add force ratios of slipping contacts to the weighted mean that is the friction.
+
+        The pads' gains cause the same error in all ratios. So the deviation of the mean is the mean
+        of the deviations s, with the same weights 1 / s^2.
+
+        Args:
+            chosen: Contacts (n,) that slip.
+            ratio: Ratios (n,) of shear and normal force.
+            deviation: Standard deviations s (n,) of the ratios.
+        """
+        if chosen.any():
+            weight = deviation**-2
+            added = np.stack([1 / deviation, weight, ratio * weight], axis=1)
+            self._contacts.sums[chosen] += added[chosen]
+
+    def _observe_shear(self, change: Array, load_change: Array) -> None:
+        """Add the values of a scan to the fits of `Slip.partial`.
+
+        A fit starts again when the normal force or the position has changed, or the contact slips.
+
+        Args:
+            change: Changes (n, V) of the values in Pa since the first scan of each fit.
+            load_change: Changes (n, 6) of the loads that follow from them.
+        """
+        contacts = self._contacts
+        outward, shear = _split_force(load_change[:, :3], contacts.normal)
+        curved = _compute_lengths(shear)[:, None] * shear
+        one = np.ones_like(outward)
+        terms = np.concatenate([one, outward, shear, curved], axis=1)
+        factors = np.concatenate([terms, change], axis=1)
+        contacts.terms = terms
+
+        force = _compute_lengths(contacts.load[:, :3])
         is_over = np.abs(outward[:, 0]) > MAX_NORMAL_CHANGE * force
-        is_over |= _compute_lengths(load[:, 3:]) > MAX_SHIFT_M
-        is_over |= contacts["slips"] | (contacts["gram"][:, 2, 2] == 0)
-        for name in ("cubes", "weights", "values"):
-            first[name][is_over] = contacts[name][is_over]
-        contacts["gram"][is_over] = contacts["moments"][is_over] = 0
+        is_over |= _compute_lengths(load_change[:, 3:]) > MAX_SHIFT_M
+        is_over |= contacts.slips | (contacts.equations[:, 2, 2] + shear[:, 0] ** 2 == 0)
+        linear = contacts.cubes, contacts.weights, contacts.values, contacts.pad_variance
+        for row, restarts in enumerate(is_over.tolist()):
+            if restarts:
+                for array in linear:
+                    array[row, _FIRST] = array[row, _NEWEST]
+                contacts.equations[row] = 0.0
+            else:
+                contacts.equations[row] += terms[row, :, None] * factors[row]
 
     def _estimate_partial_slip(self) -> Array:
         """Return `Slip.partial` (n,) by the least-squares fit at the head of this file."""
         contacts = self._contacts
-        terms, curved = contacts["terms"], contacts["terms"][:, 5:]
-        # The shear force has no component along the normal, and all sums are 0 at the start of a
-        # fit. A small addition to the diagonal lets the matrix be inverted nevertheless.
-        size = np.trace(contacts["gram"], axis1=1, axis2=2)[:, None, None]
-        inverse = np.linalg.inv(contacts["gram"] + 1e-9 * (size + 1) * np.eye(8))
-        parts = terms[:, :, None] * (inverse @ contacts["moments"])
-        change = _compute_lengths(parts[:, 2:].sum(axis=1))
-        by_pad = np.nan_to_num(self._inverse.by_pad[contacts["first"]["cubes"]])
-        covariance = (by_pad**2).sum(axis=(1, 2, 3))[:, None, None] * inverse[:, 5:, 5:]
-        variance = np.einsum("nk,nkl,nl->n", curved, covariance, curved)
-        with np.errstate(invalid="ignore"):
-            share = _compute_lengths(parts[:, 5:].sum(axis=1)) / change
-        return np.where(
-            variance < (PARTIAL_DEVIATION * change) ** 2,
-            share,
-            np.nan,
-        )
+        partial = np.full(len(self._found), np.nan)
+        # Eight coefficients need as many scans. A contact that moves begins again in every scan.
+        rows = np.flatnonzero(contacts.equations[:, 0, 0] >= 8)
+        if len(rows):
+            gram, moments = np.split(contacts.equations[rows], [8], axis=2)
+            # The shear force has no component along the normal. A small addition to the diagonal
+            # lets the matrix be inverted nevertheless.
+            size = np.trace(gram, axis1=1, axis2=2)[:, None, None]
+            inverse = np.linalg.inv(gram + 1e-9 * (size + 1) * np.eye(8))
+            terms = contacts.terms[rows, None] * _SHEAR_TERMS
+            weights = terms @ inverse
+            change, curved = _compute_lengths(weights @ moments).T
+            variance = (weights[:, 1] * terms[:, 1]).sum(axis=1)
+            variance *= contacts.pad_variance[rows, _FIRST]
+            is_known = variance < (PARTIAL_DEVIATION * change) ** 2
+            partial[rows[is_known]] = curved[is_known] / change[is_known]
+        return partial
 
     def _test_lags(
         self,
-        newest: Array,
-        change: Array,
+        motion: Array,
         duration: Array,
+        shear_ratio: Array,
+        ratio: Array,
     ) -> tuple[Mask, Mask]:
         """Test whether each contact has moved, and whether it has slipped, over each of the `LAGS`.
 
         Args:
-            newest: Motion states (n, 7) in this scan, as from `_compute_motion_states`.
-            change: Changes (n, lags, 7) of the motion states over each lag.
+            motion: Changes (n, lags, 7) of the motion states over each lag.
             duration: Durations (lags,) of the lags in s.
+            shear_ratio: Shear forces (n, 3) in this scan, divided by the normal forces.
+            ratio: Their lengths (n,).
 
         Returns:
             Whether each contact has moved (n, lags), and whether it has slipped (n, lags).
         """
-        moved = change[..., :3]
-        turned = change[..., 3:6]
+        moved = motion[..., :3]
         distance = _compute_lengths(moved)
-        shear_ratio = newest[:, 3:6]
-        ratio = _compute_lengths(shear_ratio)[:, None]
+        moves = distance > MIN_DISTANCE_M
+        if not moves.any():
+            return moves, moves
 
-        divisor = np.maximum(distance, 1e-12)
-        scalar_product = np.einsum("nlk,nlk->nl", moved, turned)
-        growth = scalar_product / divisor
+        turned = motion[..., 3:6]
+        ratio = ratio[:, None]
+        growth = (moved * turned).sum(axis=2) / np.maximum(distance, 1e-12)
         lever = LEVER_M / (1 + 2 * ratio)
         tilt = lever * np.maximum(growth, 0)
-        force_change = change[..., 3:]
-        leak = LEAK_M * _compute_lengths(force_change)
+        leak = LEAK_M * _compute_lengths(motion[..., 3:])
         # A force that changes and returns within a long lag shows no change over it, but may have
         # left the contact shifted. So each lag is allowed the largest shift of all shorter ones.
         explained = np.maximum.accumulate(tilt + leak, axis=1)
-        noise = SIGNIFICANCE * np.sqrt(2) * self._contacts["noise"]
-        threshold = np.maximum(noise, MIN_DISTANCE_M)
-        min_distance = threshold[:, None] + explained
-        moves = distance > min_distance
+        noise = SIGNIFICANCE * np.sqrt(2) * self._contacts.noise[:, None]
+        moves = distance > np.maximum(noise, MIN_DISTANCE_M) + explained
         moves &= distance > MIN_SPEED * duration
         # A lag is twice the one before. The motion over the lag before is therefore the motion in
         # the second half of a lag; if it is small, the contact has stopped.
-        late = distance[:, :-1]
-        min_late = MIN_LATE_SHARE * distance[:, 1:]
-        moves[:, 1:] &= late > min_late
+        moves[:, 1:] &= distance[:, :-1] > MIN_LATE_SHARE * distance[:, 1:]
 
-        along = np.einsum("nlk,nk->nl", moved, shear_ratio)
-        is_along = along > MIN_COSINE * distance * ratio
-        largest = MIN_SHARE_OF_LARGEST * self._contacts["largest_ratio"]
-        min_ratio = np.maximum(MIN_RATIO, largest)
-        ratio_change = _compute_lengths(turned)
-        slips = moves & is_along
-        slips &= ratio > min_ratio[:, None]
-        slips &= ratio_change < MAX_RATIO_CHANGE * ratio
+        along = (moved * shear_ratio[:, None]).sum(axis=2)
+        largest = MIN_SHARE_OF_LARGEST * self._contacts.largest_ratio
+        slips = moves & (along > MIN_COSINE * distance * ratio)
+        slips &= ratio > np.maximum(MIN_RATIO, largest)[:, None]
+        slips &= _compute_lengths(turned) < MAX_RATIO_CHANGE * ratio
         return moves, slips
 
     def _remember(self, time_s: float, newest: Array) -> None:
         """Store the motion states `newest` (n, 7) of the scan at the time `time_s` (in s)."""
-        past = self._contacts["past"]
-        if time_s < self._times[0]:
+        past = self._contacts.past
+        last_s = self._times[self._place]
+        if time_s < last_s:
             # The time has jumped back, as at the start of another recording.
             past[:] = np.nan
-        if time_s != self._times[0]:
-            past[:, 1:] = past[:, :-1].copy()
-            self._times = np.roll(self._times, 1)
-        past[:, 0] = newest
-        self._times[0] = time_s
+        if time_s != last_s:
+            self._place = (self._place + 1) % N_SCANS
+        past[:, self._place] = newest
+        self._times[self._place] = time_s
 
-    def _gather(self, scaled: Array) -> Array:
-        """Return the values (n, values) in Pa of the `N_CUBES` cubes near each of n contacts."""
-        values: Array = scaled[self._contacts["cubes"]]
-        return values.reshape(len(self._contacts), -1)
-
-    def _follow(self, scaled: Array) -> Array:
-        """Return force in N and position in m (n, 6) of each contact in a scan.
-
-        They follow from the changes of the cubes' values, with the stored derivatives.
-
-        Args:
-            scaled: Components (cubes, C) in Pa of the scan, as from `SurfaceInverse.scale_values`.
-        """
-        contacts = self._contacts
-        # A value that is missing counts as unchanged.
-        change = self._gather(scaled) - contacts["values"]
-        change = np.nan_to_num(change)
-        load_change = np.einsum("nkm,nm->nk", contacts["weights"], change)
-        loads: Array = contacts["load"] + load_change
-        return loads
-
-    def _linearise_changed(self, loads: Array, scaled: Array) -> None:
+    def _linearise_changed(
+        self,
+        loads: Array,
+        scaled: Array,
+        fits: Mapping[int, HertzFit],
+    ) -> None:
         """Linearise the response of the cubes again for contacts that are new or have changed.
 
         Args:
-            loads: Force in N and position in m (n, 6) of the contacts.
+            loads: Force in N and position in m (n, 6) of the contacts. The position of a contact
+                that is lost is replaced.
             scaled: Values (cubes, C) in Pa.
+            fits: As in `update`.
         """
         contacts = self._contacts
-        change = loads - contacts["linearised"]
+        change = loads - contacts.linearised
         depth = self._inverse.depth
-        force = _compute_lengths(loads[:, :3])
-        force = np.maximum(force, MIN_FORCE_N)
-        force_change = _compute_lengths(change[:, :3])
-        shift = _compute_lengths(change[:, 3:])
-        has_changed = force_change > MAX_FORCE_CHANGE * force
-        since_fit = _compute_lengths(loads[:, 3:] - contacts["load"][:, 3:])
-        is_inexact = since_fit > MIN_SHIFT_DEPTHS * depth
-        has_changed |= is_inexact & (shift > MAX_SHIFT_DEPTHS * depth)
-        has_changed |= shift > MAX_FITTED_SHIFT_DEPTHS * depth
+        force = np.maximum(_compute_lengths(loads[:, :3]), MIN_FORCE_N)
+        force_change = _compute_lengths(change[:, :3]) / force
+        shift = _compute_lengths(change[:, 3:]) / depth
+        since_fit = _compute_lengths(loads[:, 3:] - contacts.load[:, 3:]) / depth
+        is_near_fit = since_fit <= MIN_SHIFT_DEPTHS
+        max_shift = np.where(is_near_fit, MAX_FITTED_SHIFT_DEPTHS, MAX_SHIFT_DEPTHS)
+        has_changed = (force_change > MAX_FORCE_CHANGE) | (shift > max_shift)
+        if not has_changed.any():
+            return
 
         # After a sudden change, as of a body that bounces, linear extrapolation with the
         # derivatives gives no useful position. The contact then keeps the position of the last
         # linearisation, and its past counts as unknown.
-        has_jumped = force_change > MAX_JUMP * force
-        has_left = shift > depth
-        is_linearised = contacts["noise"] > 0
-        is_lost = (has_jumped | has_left) & is_linearised
-        last_position = contacts["linearised"][:, 3:]
-        loads[is_lost, 3:] = last_position[is_lost]
-        contacts["past"][is_lost] = np.nan
-
-        changed = np.flatnonzero(has_changed).tolist()
-        for row in changed[:MAX_LINEARISATIONS]:
-            self._linearise(row, loads, scaled)
+        has_jumped = (force_change > MAX_JUMP) | (shift > 1)
+        is_lost = has_jumped & (contacts.noise > 0)
+        loads[is_lost, 3:] = contacts.linearised[is_lost, 3:]
+        contacts.past[is_lost] = np.nan
+        for row in np.flatnonzero(has_changed)[:MAX_LINEARISATIONS].tolist():
+            self._linearise(row, loads, scaled, fits)
 
     def _linearise(
         self,
         row: int,
         loads: Array,
         scaled: Array,
+        fits: Mapping[int, HertzFit],
     ) -> None:
         """Compute the weights from changes of the cubes' values to changes of one contact's load.
 
@@ -611,28 +620,24 @@ class SlipEstimator:
             row: Number of the contact.
             loads: Force in N and position in m (n, 6) of all contacts.
             scaled: Values (cubes, C) in Pa.
+            fits: As in `update`.
         """
         inverse = self._inverse
         poses = inverse.poses
-        contact = self._contacts[row]
+        contacts = self._contacts
         positions = loads[:, 3:]
         place = positions[row]
-        offset = self._above_cubes - place
-        distance = _compute_lengths(offset)
-        normals = poses.rotation[:, :, 2]
-        cosines = normals @ contact["normal"]
-        is_turned_away = cosines < MIN_FACING
+        distance = _compute_lengths(self._above_cubes - place)
+        is_turned_away = self._normals @ contacts.normal[row] < MIN_FACING
         distance[is_turned_away] = np.inf
-        n_cubes = len(contact["cubes"])
-        by_distance = np.argsort(distance)
-        cubes = by_distance[:n_cubes]
+        cubes = np.argsort(distance)[: contacts.cubes.shape[2]]
         home = int(cubes[0])
         rotation = poses.rotation[home]
         apart = _compute_lengths(positions - place)
         is_near = apart < NEIGHBOUR_PITCHES * inverse.pitch
         near = np.argsort(apart)[: is_near.sum()]
         # The tracker has just computed the derivatives for this contact alone.
-        fit = self._fits.get(int(contact["id"]))
+        fit = fits.get(self._found[row].id)
         if fit is None or fit.values.home != home or len(near) > 1:
             # Derivatives are computed in the frame of `home`, the cube nearest to the contact.
             # Contacts near this one take part. They are sorted by distance, so that this one comes
@@ -641,74 +646,48 @@ class SlipEstimator:
             self._noise.update(usable, cubes)
             local = LocalValues(inverse, self._noise, home, cubes)
             forces = loads[near, :3] @ rotation
-            from_home = positions[near] - poses.position[home]
-            centres = from_home @ rotation
-            radii = self._contacts["radius"][near]
-            discs = Discs(forces, centres[:, :2], np.log(radii))
+            centres = (positions[near] - poses.position[home]) @ rotation
+            areas = [self._found[number].area for number in near.tolist()]
+            discs = Discs(forces, centres[:, :2], np.log(np.divide(areas, np.pi)) / 2)
             fit = HertzFit(inverse, local, discs)
             linearise(inverse, [fit])
         weights = fit.compute_weights(cubes)
 
-        by_pad = np.nan_to_num(inverse.by_pad[cubes])
-        position_weights = weights[3:]
-        noise = np.einsum("knc,ncp->knp", position_weights, by_pad)
-        mean_variance = (noise**2).sum() / 2
-        to_parent = np.zeros((6, 5))
-        to_parent[:3, :3] = rotation
-        to_parent[3:, 3:] = rotation[:, :2]
-        contact["noise"] = np.sqrt(mean_variance)
-        contact["weights"] = to_parent @ weights.reshape(5, -1)
-        contact["cubes"] = cubes
-        contact["values"] = scaled[cubes].ravel()
-        contact["load"] = loads[row]
-        contact["linearised"] = loads[row]
+        by_pad = inverse.by_pad[cubes]
+        by_pad[np.isnan(by_pad)] = 0.0
+        noise = weights[3:].swapaxes(0, 1) @ by_pad
+        by_force, by_position = np.split(weights.reshape(5, -1), [3])
+        contacts.noise[row] = np.sqrt((noise**2).sum() / 2)
+        contacts.pad_variance[row, _NEWEST] = (by_pad**2).sum()
+        contacts.weights[row, _NEWEST, :3] = rotation @ by_force
+        contacts.weights[row, _NEWEST, 3:] = rotation[:, :2] @ by_position
+        contacts.cubes[row, _NEWEST] = cubes
+        contacts.values[row, _NEWEST] = scaled[cubes].ravel()
+        contacts.load[row] = contacts.linearised[row] = loads[row]
 
 
 def _compute_lengths(vectors: Array) -> Array:
     """Return the lengths (...) of vectors (..., n)."""
-    lengths: Array = np.linalg.norm(vectors, axis=-1)
+    lengths: Array = np.sqrt((vectors * vectors).sum(axis=-1))
     return lengths
 
 
+def _split_force(force: Array, normal: Array) -> tuple[Array, Array]:
+    """Split forces (..., n, 3) into their components (..., n, 1) along normals (n, 3) and shear."""
+    outward = (force * normal).sum(axis=-1, keepdims=True)
+    return outward, force - outward * normal
+
+
 def _compute_motion_states(loads: Array, normal: Array) -> Array:
-    """Return the motion states (n, 7) of contacts: the quantities whose changes show slip.
+    """Return the motion states (..., n, 7) of contacts: the quantities whose changes show slip.
 
     They are the position (3) in m, the shear force divided by the normal force (3), and the natural
     logarithm of the normal force in N.
 
     Args:
-        loads: Force in N and position in m (n, 6) of the contacts.
+        loads: Force in N and position in m (..., n, 6) of the contacts.
         normal: Normals (n, 3) out of the skin.
     """
-    force = loads[:, :3]
-    outward = np.einsum("nk,nk->n", force, normal)
-    outward = outward[:, None]
+    outward, shear = _split_force(loads[..., :3], normal)
     pressing = np.maximum(-outward, 1e-3 * MIN_FORCE_N)
-    shear = force - outward * normal
-    position = loads[:, 3:]
-    shear_ratio = shear / pressing
-    log_force = np.log(pressing)
-    return np.concatenate([position, shear_ratio, log_force], axis=1)
-
-
-def _add_ratio(
-    contacts: Records,
-    chosen: Mask,
-    ratio: Array,
-    deviation: Array,
-) -> None:
-    """Add force ratios of slipping contacts to the weighted mean that is the friction coefficient.
-
-    The pads' gains cause the same error in all ratios. So the deviation of the mean is the mean of
-    the deviations s, with the same weights 1 / s^2.
-
-    Args:
-        contacts: The contacts; `sums` are those of 1 / s, 1 / s^2 and ratio / s^2.
-        chosen: Contacts (n,) that slip.
-        ratio: Ratios (n,) of shear and normal force.
-        deviation: Standard deviations s (n,) of the ratios.
-    """
-    weight = deviation**-2
-    columns = [1 / deviation, weight, ratio * weight]
-    sums = np.stack(columns, axis=1)
-    contacts["sums"] += np.where(chosen[:, None], sums, 0.0)
+    return np.concatenate([loads[..., 3:], shear / pressing, np.log(pressing)], axis=-1)
