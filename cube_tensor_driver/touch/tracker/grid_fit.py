@@ -31,6 +31,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg.lapack import dpstrf
 from scipy.spatial.distance import cdist
 
 from ...core.arrays import Array, Index, Single
@@ -39,6 +40,7 @@ from ..inverse import SurfaceInverse
 from ..prior import AMPLITUDE
 from ..surface import make_square_points
 from .contact_estimate import (
+    HERTZ_MOMENT,
     N_MOMENTS,
     ContactEstimate,
     ContactSum,
@@ -70,6 +72,12 @@ MAX_BORDER_REACH_DEPTHS = 4.0
 traction) are placed beyond the border of the skin, divided by the depth of the cubes' centres.
 Cubes do not feel the force of grid contacts much farther away, which would make the force of the
 contact arbitrary."""
+
+MAX_BLOCK_WIDTH = 0.9
+"""Largest side of a square block of four grid contacts (small contacts that make up the traction)
+that acts like one contact with errors of the elastomer, divided by the depth of the cubes' centres.
+Blocks of 0.8 depths hardly change forces and stated deviations; with blocks of 1.1 depths, the
+stated deviations of the forces of rods were 15 % too small."""
 
 ENVELOPE_FLOOR = 0.03
 """Smallest prior standard deviation of the force of a grid contact (one of the small contacts whose
@@ -119,10 +127,16 @@ _RELATIVE_DEVIATIONS = np.array([SHEAR_RATIO, SHEAR_RATIO, 1.0])
 """Prior standard deviations of the traction along x, y and z, divided by that of the pressure."""
 
 
-MIN_SIGNAL_TO_NOISE = 1e-4
+RANK_TOLERANCE = 1e-8
+"""Largest error of the diagonal elements of the matrix D' D (`_Decomposition`) when it is replaced
+by a matrix of smaller rank, divided by the largest element. As errors of the pads' gains limit the
+ratio of signal and noise to 1e6, the combinations of forces that are left out have a ratio below
+0.01."""
+
+MIN_SIGNAL_TO_NOISE = 0.01
 """Smallest ratio of prior variance to noise variance with which a combination of the forces of the
-grid contacts is estimated from the values. Combinations with a smaller ratio keep their prior mean,
-0, which saves half of the computing time."""
+grid contacts is estimated from the values of later scans. Combinations with a smaller ratio keep
+their prior mean, 0, which saves a third of the computing time of these scans."""
 
 
 class GridPosterior(NamedTuple):
@@ -141,7 +155,11 @@ class GridPosterior(NamedTuple):
             elastomer (sensitivity.py) except the depth, in standard deviations.
         by_errors: Change (k, S - 1) of the product of `response` and the values for one standard
             deviation of each of these errors.
-        root: Square root (3, q, 3 q + S) of the covariance of the forces, in N.
+        scale: Scale s of the prior in Pa.
+        ratios: Variances (K,) of the amplitudes of all K eigenvectors (`_Decomposition`), divided
+            by those of the prior.
+        errors_root: Square root (3 q, S) of the covariance of the forces due to the errors of the
+            elastomer, in N.
         occam_term: Part of -2 ln of the evidence that does not depend on the values.
     """
 
@@ -150,8 +168,32 @@ class GridPosterior(NamedTuple):
     to_forces: Array
     to_errors: Array
     by_errors: Array
-    root: Array
+    scale: float
+    ratios: Array
+    errors_root: Array
     occam_term: float
+
+
+class _Decomposition(NamedTuple):
+    """Eigenvalues and eigenvectors from which the posteriors for all scales of the prior follow.
+
+    The forces are combinations of 3 q unknowns with independent priors of variance 1. The design
+    matrix D (N, 3 q) contains the whitened values that each unknown causes. k eigenvalues of D' D
+    are large enough to matter (`RANK_TOLERANCE`).
+
+    Attributes:
+        eigenvalues: The eigenvalues (k,).
+        vectors: Eigenvectors V (3 q, k).
+        design: Matrix D (N, 3 q).
+        root: Matrix (3, q, q) from the unknowns to the forces along x, y and z.
+        basis: Matrix (3 q, k) from the amplitudes of the eigenvectors to the forces.
+    """
+
+    eigenvalues: Array
+    vectors: Array
+    design: Array
+    root: Array
+    basis: Array
 
 
 class _Scale(NamedTuple):
@@ -162,27 +204,31 @@ class _Scale(NamedTuple):
 
     Attributes:
         scale: Scale s in Pa.
-        variances: Variances (3 q,) of the amplitudes of the eigenvectors.
-        signal_to_noise: Ratio (3 q,) of prior variance and noise variance of each amplitude.
+        projected: Products (k, 1 + S) of the response to the eigenvectors and the values, and of
+            this response and the sensitivities of the values to the properties.
+        variances: Variances (k,) of the amplitudes of the eigenvectors.
+        signal_to_noise: Ratio (k,) of prior variance and noise variance of each amplitude.
         errors: Changes (S - 1, 2) of the estimated errors by the values and by the depth.
         information: Precision (S - 1, S - 1) of the estimated errors.
         occam_term: Part of -2 ln of the evidence that does not depend on the values.
+        score: -2 ln of the evidence, up to a constant.
     """
 
     scale: float
+    projected: Array
     variances: Array
     signal_to_noise: Array
     errors: Array
     information: Array
     occam_term: float
+    score: float
 
 
 class GridFit:
     """Traction in one region as the sum of grid contacts (small Hertz contacts on a grid).
 
-    `solve` computes the forces of the grid contacts, `settle` and `sharpen` compute their
-    posterior, which takes milliseconds each. `step` only multiplies the values of later scans by
-    matrices of this posterior.
+    `solve` and `sharpen` compute the posterior of the forces of the grid contacts, which takes
+    milliseconds. `step` only multiplies the values of later scans by matrices of this posterior.
 
     Attributes:
         places: Positions (q, 2) of the grid contacts in m, on the skin laid flat.
@@ -194,9 +240,7 @@ class GridFit:
         misfit: Chi-squared divided by the number of known values; at least 1. It multiplies the
             covariance of the forces.
         score: -2 ln of the evidence, up to a constant.
-        is_solved: Whether `solve` was called.
-        is_settled: Whether `settle` was called after the last `solve`, and after the last `sharpen`
-            that replaced the fit.
+        is_sharpened: Whether `sharpen` was called after the last `solve`.
         is_sharp: Whether `sharpen` has found that a narrower prior has no greater evidence.
     """
 
@@ -230,6 +274,14 @@ class GridFit:
         )
         self.size = _GRID_CONTACT_RADIUS * inverse.depth
         self._peak_width = _PEAK_WIDTH * inverse.depth
+        block_side = 2 if 2 * self.spacing < MAX_BLOCK_WIDTH * inverse.depth else 1
+        steps = np.rint((self.places - self.places[0]) / self.spacing)
+        blocks, block = np.unique(steps // block_side, axis=0, return_inverse=True)
+        self._is_in_block = np.eye(len(blocks))[block.ravel()]
+        # The contact that stands for a block of n x n grid contacts has the same second moments of
+        # pressure. Those of the n x n centres are (n^2 - 1) / 12 times the square of the spacing.
+        moment_of_centres = (block_side**2 - 1) / 12 * self.spacing**2
+        self._block_size = float(np.sqrt(self.size**2 + moment_of_centres / HERTZ_MOMENT))
 
         # The force of a grid contact is its pressure times the square of the spacing, so
         # covariances of forces contain the fourth power of the spacing.
@@ -250,14 +302,11 @@ class GridFit:
         # `_estimates` and `_discs` are the contacts for the newest values, once they are computed.
         self._estimates: list[ContactEstimate] = []
         self._discs: Discs | None = None
-        self.is_solved = False
-        self.is_settled = False
+        self.is_sharpened = False
         self.is_sharp = False
 
     def solve(self, white: Array) -> None:
-        """Compute the forces with the same prior for all grid contacts.
-
-        `settle` computes the posterior of the forces.
+        """Compute the posterior with the same prior for all grid contacts.
 
         Args:
             white: Values (n C,), C components of stress and gradient of each of n cubes,
@@ -268,29 +317,10 @@ class GridFit:
         self._white_response = white_response.reshape(len(white), 3, -1)
         equal_envelope = np.ones(len(self.places))
         self._decomposition = self._decompose(equal_envelope)
-        _, to_amplitudes, basis = self._decomposition
-        projected = to_amplitudes @ white
-        scale = self._find_scale(white[:, None], projected[:, None])
-        self.forces = (basis @ (scale.variances * projected)).reshape(3, -1)
-        self.is_solved = True
-        self.is_settled = False
+        values = white[:, None]
+        self._finish(values, self._find_scale(self._decomposition, values))
+        self.is_sharpened = False
         self.is_sharp = False
-
-    def settle(self, white: Array) -> None:
-        """Compute the posterior with errors of the elastomer, and divide the region into contacts.
-
-        Args:
-            white: Whitened values (n C,), as for `solve`.
-        """
-        sensitivity = self.values.compute_sensitivity(
-            self.places,
-            self.size,
-            self.forces,
-        )
-        self._set_sensitivity(sensitivity)
-        self._condition(white)
-        self._separate_contacts()
-        self.is_settled = True
 
     def sharpen(self, white: Array) -> None:
         """Fit again with a prior that allows less force where the present fit finds little force.
@@ -301,16 +331,33 @@ class GridFit:
         Args:
             white: Whitened values (n C,), as for `solve`.
         """
-        self._condition(white)
-        present = self.posterior, self._decomposition
-        score = self.score
-        self._decomposition = self._decompose(self._envelope)
-        self._condition(white)
-        self.is_sharp = self.score > score - MIN_SCORE_GAIN
-        self.is_settled = self.is_sharp
-        if self.is_sharp:
-            self.posterior, self._decomposition = present
-            self.step(white)
+        columns = np.column_stack([white, self._white_sensitivity])
+        present = self._find_scale(self._decomposition, columns)
+        narrower = self._decompose(self._envelope)
+        best = self._find_scale(narrower, columns)
+        self.is_sharpened = True
+        self.is_sharp = best.score > present.score - MIN_SCORE_GAIN
+        if not self.is_sharp:
+            self._decomposition = narrower
+            self._finish(columns, best)
+
+    def _finish(self, columns: Array, best: _Scale) -> None:
+        """Compute the posterior with errors of the elastomer, and divide the region into contacts.
+
+        Args:
+            columns: Whitened values (n C, 1 + S), followed by their sensitivities to S properties
+                of the elastomer under the forces of the last fit. They may be missing (n C, 1).
+            best: Scale of the prior that `_find_scale` returns for these columns.
+        """
+        projected = best.projected[:, 0] - best.projected[:, 2:] @ best.errors[:, 0]
+        forces = self._decomposition.basis @ (best.variances * projected)
+        self.forces = forces.reshape(3, -1)
+        # Errors of the elastomer change the values of the new forces differently.
+        self._sensitivity = self._compute_sensitivity()
+        white = self.values.whitening @ self._sensitivity
+        self._white_sensitivity = white.reshape(-1, white.shape[2])
+        self._condition(columns[:, 0])
+        self._separate_contacts()
 
     def step(self, white: Array) -> None:
         """Compute forces and misfit for new values of the same cubes.
@@ -384,19 +431,22 @@ class GridFit:
             step: Not used here; `HertzFit.to_contacts` needs it.
         """
         sizes = np.full(len(self.places), self.size)
-        root = np.sqrt(self.misfit) * self.posterior.root
-        return ContactSum(self.places, sizes, self.forces, root)
+        weights = np.eye(self.forces.size).reshape(-1, *self.forces.shape)
+        root = np.sqrt(self.misfit) * self._propagate(weights)
+        return ContactSum(self.places, sizes, self.forces, root.reshape(*self.forces.shape, -1))
 
-    def _set_sensitivity(self, sensitivity: Array) -> None:
-        """Store how errors of the elastomer change the values under the present forces.
+    def _compute_sensitivity(self) -> Array:
+        """Return how errors of the elastomer change the values under the present forces.
 
-        Args:
-            sensitivity: Changes (n, C, S) in Pa by one standard deviation of each of S properties
-                of the elastomer, the depth first.
+        The result is that of `LocalValues.compute_sensitivity` (n, C, S). Each block of grid
+        contacts acts like one contact at its centre of pressure.
         """
-        self._sensitivity = sensitivity
-        white = self.values.whitening @ sensitivity
-        self._white_sensitivity = white.reshape(-1, white.shape[2])
+        # The small force is for blocks without any.
+        pressing = np.abs(self.forces[2]) + 1e-12
+        by_contact = np.concatenate([self.forces, pressing * self.places.T, [pressing]])
+        sums = by_contact @ self._is_in_block
+        centres = sums[3:5] / sums[5]
+        return self.values.compute_sensitivity(centres.T, self._block_size, sums[:3])
 
     def _condition(self, white: Array) -> None:
         """Compute `posterior` with the scale of the prior that has the largest evidence.
@@ -404,50 +454,80 @@ class GridFit:
         Args:
             white: Whitened values (n C,).
         """
-        _, to_amplitudes, basis = self._decomposition
-        # Column 0 holds the values, column 1 their sensitivity to the depth, and the others the
-        # sensitivities to further properties of the elastomer.
+        decomposition = self._decomposition
+        basis = decomposition.basis
         columns = np.column_stack([white, self._white_sensitivity])
-        projected = to_amplitudes @ columns
-        best = self._find_scale(columns, projected)
-        scale, variances, information = best.scale, best.variances, best.information
+        best = self._find_scale(decomposition, columns)
+        scale, variances, projected = best.scale, best.variances, best.projected
+
+        # The errors of the elastomer add two parts to the covariance: one for the estimated errors
+        # and one for the error of the depth.
         by_column = basis @ (variances[:, None] * projected[:, 1:])
         by_depth = by_column[:, :1] - by_column[:, 1:] @ best.errors[:, 1:]
-        # The covariance is the sum of three parts: that for an exactly known elastomer, and those
-        # due to its estimated errors and to the error of the depth. Its square root consists of the
-        # columns of the square roots of these parts.
-        cholesky_factor = np.linalg.cholesky(information)
-        errors_root = np.linalg.inv(cholesky_factor).T
-        exact_root = basis * np.sqrt(variances)
-        root = np.hstack([exact_root, by_column[:, 1:] @ errors_root, by_depth])
-        to_errors = columns[:, 2:].T - (projected[:, 2:].T * variances) @ to_amplitudes
+        cholesky_factor = np.linalg.cholesky(best.information)
+        by_errors = by_column[:, 1:] @ np.linalg.inv(cholesky_factor).T
+
+        design, vectors = decomposition.design, decomposition.vectors
+        explained = design @ (vectors @ (variances[:, None] * projected[:, 2:]))
+        to_errors = np.linalg.solve(best.information, (columns[:, 2:] - explained).T)
         is_known = best.signal_to_noise > MIN_SIGNAL_TO_NOISE
+        response = vectors[:, is_known].T.astype(np.float32) @ design.T.astype(np.float32)
+        ratios = 1 / (1 + best.signal_to_noise)
         self.posterior = GridPosterior(
-            response=(scale * to_amplitudes[is_known]).astype(np.float32),
-            shrinkage=variances[is_known] / scale**2,
+            response=np.float32(scale) * response,
+            shrinkage=ratios[is_known],
             to_forces=scale * basis[:, is_known],
-            to_errors=np.linalg.solve(information, to_errors),
+            to_errors=to_errors,
             by_errors=scale * projected[is_known, 2:],
-            root=root.reshape(3, len(self.places), -1),
+            scale=scale,
+            ratios=ratios,
+            errors_root=np.hstack([by_errors, by_depth]),
             occam_term=best.occam_term,
         )
         self.step(white)
 
-    def _find_scale(self, columns: Array, projected: Array) -> _Scale:
+    def _propagate(self, weights: Array) -> Array:
+        """Return a square root (m, n) of the covariance of m weighted sums of the forces.
+
+        It is divided by the square root of the misfit.
+
+        Args:
+            weights: Weights (m, 3, q) of the forces along x, y and z.
+        """
+        posterior, decomposition = self.posterior, self._decomposition
+        count = len(weights)
+        flat = weights.reshape(count, -1)
+        # The values reduce the deviations of the prior along the eigenvectors only.
+        by_axis = weights.swapaxes(0, 1) @ decomposition.root
+        prior = by_axis.swapaxes(0, 1).reshape(count, -1)
+        along = flat @ decomposition.basis
+        exact = prior - along * (1 - np.sqrt(posterior.ratios)) @ decomposition.vectors.T
+        return np.hstack([posterior.scale * exact, flat @ posterior.errors_root])
+
+    @property
+    def _normal_covariance(self) -> Array:
+        """Covariance (q, q) of the normal forces, divided by the misfit, in N^2."""
+        posterior, decomposition = self.posterior, self._decomposition
+        root = decomposition.root[2]
+        basis, errors_root = decomposition.basis[-len(root) :], posterior.errors_root[-len(root) :]
+        exact = root @ root.T - basis * (1 - posterior.ratios) @ basis.T
+        return np.asarray(posterior.scale**2 * exact + errors_root @ errors_root.T)
+
+    def _find_scale(self, decomposition: _Decomposition, columns: Array) -> _Scale:
         """Find the scale of the prior that has the largest evidence.
 
         Args:
+            decomposition: Result of `_decompose`.
             columns: Whitened values (n C, 1 + S), followed by their sensitivities to S properties
                 of the elastomer, the depth first.
-            projected: Products (3 q, 1 + S) of the decomposition with these columns.
         """
-        eigenvalues = self._decomposition[0]
         prior_variances = _SCALES[:, None] ** 2
+        projected = decomposition.vectors.T @ (decomposition.design.T @ columns)
 
         # `products` are the products columns' W columns for every scale s, with the matrix
         # W = (1 + s^2 B K B')^-1. By the Woodbury identity, they are columns' columns minus the
         # part that the prior of the forces explains.
-        signal_to_noise = prior_variances * eigenvalues
+        signal_to_noise = prior_variances * decomposition.eigenvalues
         weights = prior_variances / (1 + signal_to_noise)
         explained_by_forces = (projected.T * weights[:, None]) @ projected
         products = columns.T @ columns - explained_by_forces
@@ -469,11 +549,13 @@ class GridFit:
         best = int(np.argmin(scores))
         return _Scale(
             scale=float(_SCALES[best]),
+            projected=projected,
             variances=weights[best],
             signal_to_noise=signal_to_noise[best],
             errors=errors[best],
             information=information[best],
             occam_term=float(occam_terms[best]),
+            score=float(scores[best]),
         )
 
     @property
@@ -481,7 +563,7 @@ class GridFit:
         """Prior standard deviations (q,) of the forces of the grid contacts for `sharpen`, divided
         by the largest one. Their squares are the expected squares of the normal forces in the
         present posterior, smoothed over neighbouring grid contacts."""
-        normal_variance = self.misfit * (self.posterior.root[2] ** 2).sum(axis=1)
+        normal_variance = self.misfit * self._normal_covariance.diagonal()
         mean_square = self.forces[2] ** 2 + normal_variance
         smoothing = np.exp(-self._squared_distances / (2 * self.spacing**2))
         smooth_square = smoothing @ mean_square / smoothing.sum(axis=1)
@@ -492,14 +574,13 @@ class GridFit:
         """Assign each grid contact to one of the peaks of the pressure; each peak is a contact."""
         exponents = self._squared_distances / (2 * self._peak_width**2)
         smoothing = np.exp(-exponents)
-        root = self.posterior.root
-        normal_root = np.sqrt(self.misfit) * root[2]
+        covariance = self._normal_covariance
         # Diagonal neighbours on the grid are 1.41 spacings apart.
         reach = 1.5 * self.spacing
         is_neighbour = self._squared_distances < reach**2
         labels = split_peaks(
             -smoothing @ self.forces[2],
-            smoothing @ normal_root,
+            self.misfit * smoothing @ covariance @ smoothing,
             is_neighbour,
         )
         self._estimates = []
@@ -512,25 +593,19 @@ class GridFit:
             centre = self.places[own].mean(axis=0)
             polynomials = np.zeros((len(labels), N_MOMENTS))
             polynomials[own] = compute_moment_polynomials(self.places[own] - centre)
-            moments_root = polynomials.T @ root
-            columns = moments_root.reshape(3 * N_MOMENTS, -1).T
+            weights = np.zeros((3, N_MOMENTS, 3, len(labels)))
+            for axis in range(3):
+                weights[axis, :, axis] = polynomials.T
+            columns = self._propagate(weights.reshape(-1, 3, len(labels))).T
             triangle = np.asarray(np.linalg.qr(columns, mode="r"))
             self._contacts.append((centre, polynomials, triangle.T.reshape(3, N_MOMENTS, -1)))
 
-    def _decompose(self, envelope: Array) -> tuple[Array, Array, Array]:
+    def _decompose(self, envelope: Array) -> _Decomposition:
         """Compute the eigenvalues and eigenvectors from which every posterior follows.
-
-        The forces are combinations of 3 q unknowns with independent priors of variance 1. The
-        design matrix D (n C, 3 q) contains the whitened values that each unknown causes.
 
         Args:
             envelope: Prior standard deviation (q,) of the force of each of q grid contacts, divided
                 by the largest one.
-
-        Returns:
-            Eigenvalues (3 q,) of D' D with the eigenvectors V (3 q, 3 q); the product V' D'; and
-            the matrix (3 q, 3 q) from amplitudes of the eigenvectors to the forces of the grid
-            contacts.
         """
         covariance = self._covariance * np.outer(envelope, envelope)
         # Rounding errors could give the covariance a negative eigenvalue, and this tiny increase of
@@ -538,14 +613,30 @@ class GridFit:
         n_grid_contacts = len(covariance)
         covariance[np.diag_indices(n_grid_contacts)] *= 1 + 1e-8
         cholesky_factor = np.linalg.cholesky(covariance)
-        axis_roots = _RELATIVE_DEVIATIONS[:, None, None] * cholesky_factor
+        root = _RELATIVE_DEVIATIONS[:, None, None] * cholesky_factor
         by_axis = self._white_response.reshape(-1, 3, n_grid_contacts).swapaxes(0, 1)
-        design = np.concatenate(by_axis @ axis_roots, axis=1)
-        eigenvalues, vectors = np.linalg.eigh(design.T @ design)
+        design = np.concatenate(by_axis @ root, axis=1)
+
+        # A pivoted Cholesky decomposition finds k < 3 q columns L with L L' = D' D up to the
+        # tolerance. The smaller matrix L' L has the same eigenvalues.
+        gram = design.T @ design
+        largest = float(gram.diagonal().max())
+        upper, pivots, rank, _ = dpstrf(gram, tol=RANK_TOLERANCE * largest)
+        # LAPACK returns the matrix in the order of Fortran, in which its rows are not contiguous.
+        columns = np.tril(upper[:rank].T)
+        eigenvalues, small_vectors = np.linalg.eigh(columns.T @ columns)
         # Rounding errors may make the smallest eigenvalues negative.
-        eigenvalues = np.maximum(eigenvalues, 0)
-        basis = axis_roots @ vectors.reshape(3, n_grid_contacts, -1)
-        return eigenvalues, vectors.T @ design.T, basis.reshape(3 * n_grid_contacts, -1)
+        eigenvalues = np.maximum(eigenvalues, np.finfo(float).eps * largest)
+        vectors = np.empty_like(columns)
+        vectors[pivots - 1] = columns @ (small_vectors / np.sqrt(eigenvalues))
+        basis = root @ vectors.reshape(3, n_grid_contacts, -1)
+        return _Decomposition(
+            eigenvalues=eigenvalues,
+            vectors=vectors,
+            design=design,
+            root=root,
+            basis=basis.reshape(3 * n_grid_contacts, -1),
+        )
 
 
 def _place_grid_contacts(

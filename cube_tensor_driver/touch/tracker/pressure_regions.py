@@ -151,7 +151,7 @@ def _list_neighbours(tree: cKDTree, distance: float) -> Index:
     return rows
 
 
-def split_peaks(pressure: Array, root: Array, is_neighbour: Mask) -> Index:
+def split_peaks(pressure: Array, covariance: Array, is_neighbour: Mask) -> Index:
     """Assign the grid points of a region to peaks of the pressure that are separated by valleys.
 
     Grid points are the centres of grid contacts (grid_fit.py). `VALLEY`, `MIN_FALL` and `MIN_PEAK`
@@ -159,7 +159,7 @@ def split_peaks(pressure: Array, root: Array, is_neighbour: Mask) -> Index:
 
     Args:
         pressure: Pressure (q,) at the grid points, in any unit.
-        root: Square root R (q, n) of its covariance R R' (q, q), in the unit of the pressure.
+        covariance: Its covariance (q, q), in the squared unit of the pressure.
         is_neighbour: Whether two grid points are neighbours (q, q).
 
     Returns:
@@ -187,9 +187,10 @@ def split_peaks(pressure: Array, root: Array, is_neighbour: Mask) -> Index:
         for other in around[1:]:
             peak = peaks[other]
             fall = pressure[peak] - pressure[point]
-            uncertainty = np.linalg.norm(root[peak] - root[point])
+            variances = covariance[peak, peak] + covariance[point, point]
+            variance = variances - 2 * covariance[peak, point]
             relative_limit = (1 - VALLEY) * pressure[peak]
-            significant_fall = MIN_FALL * uncertainty
+            significant_fall = MIN_FALL * np.sqrt(max(variance, 0.0))
             if fall < max(relative_limit, significant_fall):
                 owner = [first if one == other else one for one in owner]
     # Points without an owner have too little pressure for a peak of their own, and had no neighbour

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from copy import copy
 from enum import IntEnum
 
 import numpy as np
@@ -162,32 +161,30 @@ class Work(IntEnum):
     """Next step of the fit of a region of contact. Steps with the smallest number are made first.
 
     MOVE makes a Gauss-Newton step of Hertz contacts. BEGIN makes the first fit of a Hertz contact.
-    PREPARE places grid contacts (small contacts on a grid); SOLVE and SETTLE fit the traction by
-    them. CHOOSE tries one Hertz contact for each contact instead. RENEW solves again for the same
-    grid contacts. SHARPEN repeats the fit with a narrower prior. NONE stands for a fit that needs
-    no step.
+    PREPARE places grid contacts (small contacts on a grid); SOLVE fits the traction by them. CHOOSE
+    tries one Hertz contact for each contact instead. RENEW solves again for the same grid contacts.
+    SHARPEN repeats the fit with a narrower prior, or with the newest stress of other regions if
+    that has changed. NONE stands for a fit that needs no step.
     """
 
     MOVE = 0
     BEGIN = 1
-    SETTLE = 2
-    SOLVE = 3
-    CHOOSE = 4
-    PREPARE = 5
-    RENEW = 6
-    SHARPEN = 7
-    NONE = 8
+    SOLVE = 2
+    CHOOSE = 3
+    PREPARE = 4
+    RENEW = 5
+    SHARPEN = 6
+    NONE = 7
 
 
 WORK_MS = {
     Work.MOVE: 0.5,
     Work.BEGIN: 2.0,
-    Work.SETTLE: 4.0,
-    Work.SOLVE: 6.0,
+    Work.SOLVE: 7.5,
     Work.CHOOSE: 2.5,
     Work.PREPARE: 5.0,
-    Work.RENEW: 6.0,
-    Work.SHARPEN: 6.5,
+    Work.RENEW: 7.5,
+    Work.SHARPEN: 7.0,
 }
 """Approximate CPU time, in ms, of the steps of a region with `MAX_GRID_CONTACTS` grid contacts. The
 work in a scan is counted with these numbers, not with a clock, so that a recording gives the same
@@ -406,8 +403,8 @@ class TrackedRegion:
         """Whether the fits of this region and of all regions near agree with the newest values.
 
         A fit does not agree if its misfit has grown. The fit of this region does not agree, either,
-        if it must be repeated or finished first, for example because the response to other regions
-        has changed.
+        if it must be repeated first. A fit with an equal prior for all grid contacts agrees even if
+        the response to other regions has changed, because it follows the newest response.
         """
         is_worse = any(one._is_misfit_larger for one in (self, *self.near))
         if is_worse or not self.has_fitted_neighbours:
@@ -495,7 +492,7 @@ class TrackedRegion:
         if fit is None and self._is_hertz_due:
             return Work.BEGIN
         if self._prepared is not None:
-            return Work.SETTLE if self._prepared.is_solved else Work.SOLVE
+            return Work.SOLVE
         is_worse = self._is_misfit_larger
         may_prepare = not self._is_tried
         if isinstance(fit, HertzFit):
@@ -505,13 +502,12 @@ class TrackedRegion:
             is_lastingly_worse = is_worse and self._bad_scans >= MAX_BAD_SCANS
             may_prepare &= is_lastingly_worse and self.has_fitted_neighbours
         elif fit is not None:
-            if not fit.is_settled:
-                return Work.SETTLE
             if self._is_hertz_due:
                 return Work.CHOOSE
             if may_prepare and self._moved_share <= MAX_CHANGE:
                 peak_change = abs(self.peak / self._fitted_peak - 1)
-                if peak_change > MAX_CHANGE or is_worse or self._have_others_changed(fit):
+                have_others_changed = fit.is_sharpened and self._have_others_changed(fit)
+                if peak_change > MAX_CHANGE or is_worse or have_others_changed:
                     return Work.RENEW
                 may_prepare = False
             if not may_prepare:
@@ -542,8 +538,6 @@ class TrackedRegion:
             self._prepare_grid()
         elif work in (Work.SOLVE, Work.RENEW):
             self._solve_grid()
-        elif work == Work.SETTLE:
-            self._settle_grid()
         elif isinstance(fit, HertzFit):
             self._steps += 1
             before = fit.found
@@ -553,6 +547,8 @@ class TrackedRegion:
                 fit.found = before
         elif isinstance(fit, GridFit) and work == Work.CHOOSE:
             self._replace_by_hertz(fit)
+        elif isinstance(fit, GridFit) and self._have_others_changed(fit):
+            self._solve_grid()
         elif isinstance(fit, GridFit):
             fit.sharpen(self._whiten(fit.values))
             self._is_hertz_due = fit.is_sharp
@@ -665,23 +661,12 @@ class TrackedRegion:
     def _solve_grid(self) -> None:
         """Fit the forces of the prepared grid contacts, or else those of the present fit again."""
         self._is_tried = True
-        fit = self._prepared or copy(self.fit)
-        self._prepared = None
-        if isinstance(fit, GridFit) and fit.values.has_same_values:
-            fit.values = copy(fit.values)
-            fit.solve(self._whiten_newest(fit.values))
-            self._prepared = fit
-
-    def _settle_grid(self) -> None:
-        """Finish the fit that has been solved or sharpened, and keep it."""
         fit = self._prepared or self.fit
         self._prepared = None
         if isinstance(fit, GridFit) and fit.values.has_same_values:
-            self.subtract_others(fit.values, *self._respond(fit.values.cubes))
-            fit.settle(self._whiten(fit.values))
-            if fit is not self.fit:
-                self._is_hertz_due = not self._is_direct
-                self._accept(fit)
+            fit.solve(self._whiten_newest(fit.values))
+            self._is_hertz_due = not self._is_direct
+            self._accept(fit)
 
     def _replace_by_hertz(self, grid_fit: GridFit) -> None:
         """Replace the fit by grid contacts by one Hertz contact for each of its contacts, if that
