@@ -418,7 +418,7 @@ class SurfaceInverse:
         windows = self._windows
         scale = windows.compute_scale(y, pad_variance, known)
         variance = windows.multiply(windows.matrices.by_pad, pad_variance)
-        variance += scale[:, None, None] * windows.matrices.prior[windows.kind]
+        variance += scale[:, None, None] * windows.matrices.variance[windows.kind]
         for prediction in self._predictions:
             prediction.add_variance(variance, scale, pad_variance)
         deviation = np.sqrt(variance.reshape(-1, 2) + self._error_variance)

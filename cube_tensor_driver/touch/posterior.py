@@ -65,23 +65,25 @@ follows from the values of the cubes.
 
 
 class _WindowMatrices(NamedTuple):
-    """Matrices of K kinds of windows (cubes nearest to one cube) for the formulas at the file head.
+    """Matrices of all kinds of windows (cubes nearest to one cube) for the formulas of this file.
 
     A window has W cubes with C values and P pads each. The traction is computed at q points around
-    its centre cube. The window's first cubes, I in number, are its inner cubes (`INNER_CUBES`).
+    its centre cube. The first cubes of the window are its inner cubes (`INNER_CUBES`).
 
     Attributes:
-        gain: Matrices G (K, q, 4, W C) from the values of the window's cubes to the four results at
+        gain: Matrices G (kinds, q, 4, W C) from the values of the window's cubes to the results at
             each point: the traction along x, y and z, and the pressure at the cubes' depth.
-        prior: Posterior variances (K, q, 2) in Pa^2 of the pressure on the surface and at the
-            cubes' depth, at the scale s = 1 and without errors of the pads.
-        by_pad: Variances (K, q, 2, W P) of these pressures by the noise of each pad, (G B)^2.
-        precision: Matrices P (K, I C, I C) of the values of the inner cubes, in 1/Pa^2.
-        trace: Contributions diag(B' P B) (K, 1, I P) of the pads of the inner cubes to the scale.
+        variance: Posterior variances (kinds, q, 2) in Pa^2 of the pressure on the surface and of
+            that at the cubes' depth, at the scale s = 1 and without errors of the pads.
+        by_pad: Variances (kinds, q, 2, W P) in Pa^2 of these pressures by the noise of each pad,
+            the squares of G B.
+        precision: Matrices P (kinds, inner C, inner C) of the values of the inner cubes, in 1/Pa^2.
+        trace: Contributions diag(B' P B) (kinds, 1, inner P) of the pads of the inner cubes to the
+            scale.
     """
 
     gain: Single
-    prior: Single
+    variance: Single
     by_pad: Single
     precision: Single
     trace: Single
@@ -93,7 +95,7 @@ class WindowPosteriors:
     Attributes:
         near: Indices (cubes, W) of the cubes of each window, sorted by their distance from its
             centre cube, which comes first.
-        inner: Indices (cubes, I) of the inner cubes of each window, the first columns of `near`.
+        inner: Indices (cubes, inner) of the inner cubes of each window, the first of its cubes.
         kind: Index (cubes,) of the kind of each window.
         matrices: Matrices of the kinds of windows.
         pads: Noise matrices (cubes, C, P) of all cubes in Pa, 0 where nothing is observed.
@@ -150,7 +152,7 @@ class WindowPosteriors:
         place: Array,
         angle: Array,
     ) -> Index:
-        """Find windows of the same kind: same relative poses, noise and calibrations.
+        """Set the kind of each window: windows with equal poses, noise and calibrations are alike.
 
         Args:
             by_pad: Noise matrices (cubes, C, P).
@@ -177,8 +179,8 @@ class WindowPosteriors:
             return_counts=True,
         )
 
-        # Kinds with only one window come first, so that `multiply` can multiply all of them in one
-        # batch. The other kinds are multiplied one by one.
+        # Kinds with only one window come first, so that `multiply` can handle all of them in one
+        # batch. It goes through the other kinds one by one.
         order = np.argsort(count > 1, kind="stable")
         self.kind = np.argsort(order)[kind.reshape(n)]
         first = first[order]
@@ -192,12 +194,12 @@ class WindowPosteriors:
         """Multiply the values of the cubes of every window by the matrix of the window's kind.
 
         Args:
-            matrices: Matrices (K, ..., w k) of all kinds, for k values of the first w cubes of a
-                window.
+            matrices: Matrices (kinds, ..., n k) from k values of each of the first n cubes of a
+                window to any results.
             values: Values (cubes, k).
 
         Returns:
-            Products (cubes, ...), computed in single precision.
+            Results (cubes, ...) for all windows, computed in single precision.
         """
         *shape, width = matrices.shape
         matrices = matrices.reshape(len(matrices), -1, width)
@@ -253,7 +255,7 @@ def _solve_window(
         variant: Index (W,) of each cube's calibration in the measurement model.
 
     Returns:
-        Arrays of `_WindowMatrices` by name, without their first axis.
+        The arrays of `_WindowMatrices` for this window by name.
     """
     n, width, _ = by_pad.shape
     size = n * width
@@ -300,7 +302,7 @@ def _solve_window(
     trace = np.einsum("dp,dp->p", precision @ noise, noise)
     arrays = {
         "gain": gain,
-        "prior": np.maximum(variance[:, 2:], 0),
+        "variance": np.maximum(variance[:, 2:], 0),
         "by_pad": effect.reshape(len(points), 2, -1) ** 2,
         "precision": precision,
         "trace": trace[None],
