@@ -3,25 +3,10 @@
 
 #include "cube_scan.h"
 
+#include "cube_vector.h"
+
 #include <math.h>
 #include <string.h>
-
-/* On x86, GCC also compiles versions of a function with the vector instructions of AVX-512 and AVX2.
- * The loader chooses the best one that the processor has. All give the same bits.
- * LANES tells the compiler that the iterations of the next loop are independent of each other. */
-#if defined(__GNUC__) && !defined(__clang__)
-#define INLINE static inline __attribute__((always_inline))
-#define LANES _Pragma("GCC ivdep") _Pragma("GCC unroll 1")
-#if defined(__x86_64__) && defined(__GLIBC__) && !defined(__SANITIZE_ADDRESS__)
-#define CLONES __attribute__((target_clones("avx512f", "avx2", "default")))
-#endif
-#else
-#define INLINE static inline
-#define LANES
-#endif
-#ifndef CLONES
-#define CLONES
-#endif
 
 /* Bits of core/status.py, and limits of core/health/statistics.py. */
 enum { PAD_FAULT = 1, RESIDUAL = 2, INVALID = 4, TEMPERATURE = 8, STAMP = 2048, COMPENSATION = 4096 };
