@@ -1,4 +1,7 @@
-"""The kernel of a scan in C (native/python_scan.c); core/kernel/run.py tells whether it exists."""
+"""The kernel of a scan and the response to contacts in C (native/python_scan.c).
+
+core/kernel/run.py tells whether they exist.
+"""
 
 from .core.arrays import AnyArray
 
@@ -31,6 +34,27 @@ def filter(*arrays: AnyArray) -> None:
 
     Args:
         arrays: Arguments of `_advance`.
+
+    Raises:
+        ValueError: An array has another type or shape, or is not contiguous.
+    """
+
+def respond(*arrays: AnyArray) -> None:
+    """Compute the values of cubes under Hertz contacts; native/cube_contact.h states the arrays.
+
+    Args:
+        arrays: The first ones of `CUBE_CONTACT_ARRAYS`, up to `result`.
+
+    Raises:
+        ValueError: An array has another type or shape, or is not contiguous.
+    """
+
+def linearise(halfway: float, *arrays: AnyArray | None) -> None:
+    """Linearise the values of cubes in the parameters of Hertz contacts.
+
+    Args:
+        halfway: Number by which lengths are divided for the effect of errors of the elastomer.
+        arrays: `CUBE_CONTACT_ARRAYS` of native/cube_contact.h, but None instead of `result`.
 
     Raises:
         ValueError: An array has another type or shape, or is not contiguous.

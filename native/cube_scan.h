@@ -97,7 +97,7 @@ typedef struct {
 /* Use of an array: INPUT and OPTION are read, STATE is read and written, RESULT is written. OPTION and
  * STATE may be absent. */
 enum cube_scan_use { CUBE_SCAN_INPUT, CUBE_SCAN_OPTION, CUBE_SCAN_STATE, CUBE_SCAN_RESULT };
-#define CUBE_SCAN_LETTERS "NCPGDTEKQM"
+#define CUBE_SCAN_LETTERS "NCPGDTEKQMRVOJ"
 
 typedef struct {
 #define CUBE_SCAN_FIELD(type, name, kind, shape, use) type *name;

@@ -1,7 +1,8 @@
 // Copyright 2026 cube_tensor_driver authors
 // SPDX-License-Identifier: Apache-2.0
 
-/* The Python module cube_tensor_driver._scan: cube_scan.h for cube_tensor_driver/core/kernel.
+/* The Python module cube_tensor_driver._scan: cube_scan.h for cube_tensor_driver/core/kernel,
+ * and cube_contact.h for cube_tensor_driver/touch.
  *
  * Plain C API of Python, limited to the stable ABI of 3.10. Arrays of numpy come by their attribute
  * __array_struct__ (numpy, "The array interface protocol"), so that no header of numpy is needed. */
@@ -9,6 +10,7 @@
 #define Py_LIMITED_API 0x030A0000
 #include <Python.h>
 
+#include "cube_contact.h"
 #include "cube_scan.h"
 
 typedef struct {
@@ -93,10 +95,31 @@ static PyObject *filter(PyObject *module, PyObject *args) {
     return Py_NewRef(Py_None);
 }
 
+static PyObject *respond(PyObject *module, PyObject *args) {
+    (void)module;
+    cube_contact_call call = cube_contact_begin();
+    store_all(args, 0, cube_contact_arrays, CUBE_RESPOND_N_ARRAYS, &call, call.length);
+    if (!PyErr_Occurred() && !cube_respond(&call))
+        PyErr_SetString(PyExc_ValueError, "the arrays do not fit together");
+    return PyErr_Occurred() ? NULL : Py_NewRef(Py_None);
+}
+
+static PyObject *linearise(PyObject *module, PyObject *args) {
+    (void)module;
+    cube_contact_call call = cube_contact_begin();
+    store_all(args, 1, cube_contact_arrays, CUBE_CONTACT_N_ARRAYS, &call, call.length);
+    const double factor = PyErr_Occurred() ? 0 : PyFloat_AsDouble(PyTuple_GetItem(args, 0));
+    if (!PyErr_Occurred() && !cube_linearise(&call, factor))
+        PyErr_SetString(PyExc_ValueError, "the arrays do not fit together");
+    return PyErr_Occurred() ? NULL : Py_NewRef(Py_None);
+}
+
 static PyMethodDef functions[] = {
     {"run", run, METH_VARARGS, NULL},
     {"forces", forces, METH_VARARGS, NULL},
     {"filter", filter, METH_VARARGS, NULL},
+    {"respond", respond, METH_VARARGS, NULL},
+    {"linearise", linearise, METH_VARARGS, NULL},
     {NULL, NULL, 0, NULL}};
 
 static struct PyModuleDef module = {

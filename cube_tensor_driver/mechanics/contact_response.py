@@ -18,7 +18,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..core.arrays import Array, Complex, Index, Single
+from ..core.arrays import AnyArray, Array, Complex, Index, Single
+from ..core.modes import STRESS
 from .cache import load_or_compute
 from .circular import FIELD_FROM_CIRCULAR, ORDERS, Orders, compute_rotation_phases, rotate_loads
 from .distance_table import DistanceTable, compute_cubic_weights, to_polar
@@ -35,6 +36,10 @@ hundredth of the largest value; it is largest for wide discs."""
 _SIZE_LOG_STEP = float(np.log(DISC_SIZES[1] / DISC_SIZES[0]))
 """Difference of the natural logarithms of two neighbouring radii in `DISC_SIZES`."""
 
+LANES = 16
+"""Number of circular components, or of measured components, that the functions in C compute side by
+side. Tables and matrices are padded with zeros to multiples of it, as the functions require."""
+
 _MIN_DISTANCE = 1 / 50
 """Smallest distance along the surface between a contact and a cube, divided by the depth of the
 cubes' centres, at which derivatives are computed. Nearer contacts get the derivatives at this
@@ -49,6 +54,10 @@ class ContactResponse:
     (N,) in the measurement model. Forces are along x, y and z.
 
     The first set-up for a layer takes a few seconds; later ones load the tables from the cache.
+
+    Attributes:
+        n_quantities: Number S of quantities of the elastomer whose errors change the response
+            (`compute_sensitivity`).
     """
 
     def __init__(self, cubes: CubeMeasurement) -> None:
@@ -69,16 +78,46 @@ class ContactResponse:
 
         # For `compute_response_to_forces` and `compute_sensitivity`, the tables are matrices with
         # one row for each pair of a radius and a distance.
-        width = 3 * len(self._order)
-        rows = self._response.reshape(-1, width)
-        self._rows = rows.astype(np.float32)
+        self._rows = _make_rows(self._response)
         self._point_matrix = cubes.point_matrix.astype(np.float32)
         changes = []
         for spectra in compute_sensitivities(cubes.layer, cubes.depth):
             change = self._tabulate_discs(spectra, bessel)
             changes.append(change)
-        by_quantity = np.stack(changes, axis=2).astype(np.float32)
-        self._sensitivity_rows = by_quantity.reshape(len(self._rows), -1)
+        self.n_quantities = len(changes)
+        self._sensitivity_rows = _make_rows(np.concatenate(changes, axis=2))
+        # Result of `collect_tables`, and the measurement matrices for which it was computed.
+        self._packed: tuple[AnyArray, ...] = ()
+        self._packed_matrices: Array | None = None
+
+    def collect_tables(self, columns: Index) -> tuple[AnyArray, ...]:
+        """Return the tables of the skin for the functions in C (native/cube_contact.h).
+
+        Args:
+            columns: Indices (C,) of the measured components that the functions compute; the same
+                ones in every call.
+        """
+        matrices = self._cubes.matrices
+        if matrices is not self._packed_matrices:
+            self._packed_matrices = matrices
+            scale = [
+                self._table.step,
+                _MIN_DISTANCE * self._depth,
+                np.log(DISC_SIZES[0] * self._depth),
+                _SIZE_LOG_STEP,
+                np.count_nonzero(columns < len(STRESS)),
+            ]
+            shape = self._response.shape[:2]
+            self._packed = (
+                np.array(scale),
+                self._rows.reshape(*shape, 3, -1),
+                _pad(self._order),
+                _pack(matrices, columns),
+                self._sensitivity_rows.reshape(*shape, -1, LANES),
+                _pad(ORDERS),
+                _pack(self._cubes.point_matrix[None], columns)[0],
+            )
+        return self._packed
 
     def _tabulate_discs(self, spectra: Spectra, bessel: BesselTable) -> Array:
         """Tabulate the response to forces on discs of all radii `DISC_SIZES`.
@@ -236,8 +275,8 @@ class ContactResponse:
         weights = over_size.T[:, :, None] * over_distance.T[:, None]
         by_row = weights.reshape(-1, 16, 4).swapaxes(1, 2)
         functions = by_row.astype(np.float32) @ neighbours
-        shape = len(distance), 4, 3, -1
-        return np.asarray(functions.reshape(shape))
+        by_function = functions.reshape(len(distance), 4, 3, -1)
+        return np.asarray(by_function[..., : len(self._order)])
 
     def compute_response_to_forces(
         self,
@@ -348,7 +387,8 @@ class ContactResponse:
         weights = weights.T.astype(np.float32)
         n, n_orders = len(place), len(order)
         interpolated = weights[:, None] @ neighbours
-        parts = interpolated.reshape(n, -1, 3, n_orders)
+        n_padded = n_orders + -n_orders % LANES
+        parts = interpolated.reshape(n, -1, 3, n_padded)[..., :n_orders]
 
         # The radial and the tangential force are the real and the imaginary part of the tangential
         # vector F_x + i F_y, rotated into the direction from the contact to the cube.
@@ -454,6 +494,32 @@ def _find_size_index(size: Array | float, depth: float) -> Array:
     index = np.log(ratio) / _SIZE_LOG_STEP
     last = len(DISC_SIZES) - 2.001
     return np.asarray(np.clip(index, 1.0, last))
+
+
+def _pad(values: AnyArray, axis: int = -1) -> AnyArray:
+    """Append zeros along an axis until its length is a multiple of `LANES`."""
+    widths = [(0, 0)] * values.ndim
+    widths[axis] = 0, -values.shape[axis] % LANES
+    return np.pad(values, widths)
+
+
+def _make_rows(table: Array) -> Single:
+    """Return a table (radii, distances, ..., n) with one row for each pair of radius and distance.
+
+    The last axis is padded (`_pad`) first.
+    """
+    padded = _pad(table).astype(np.float32)
+    return padded.reshape(len(table) * table.shape[1], -1)
+
+
+def _pack(matrices: Array, columns: Index) -> Single:
+    """Return the chosen columns of measurement matrices (variants, 2 n, 15) as a padded array.
+
+    Returns:
+        Array (variants, 2, n, C) for the real and the imaginary parts; n and C are padded (`_pad`).
+    """
+    by_part = matrices[..., columns].reshape(len(matrices), 2, -1, len(columns))
+    return _pad(_pad(by_part), axis=2).astype(np.float32)
 
 
 def _split(circular: Complex) -> Array:

@@ -650,7 +650,7 @@ class SlipEstimator:
             areas = [self._found[number].area for number in near.tolist()]
             discs = Discs(forces, centres[:, :2], np.log(np.divide(areas, np.pi)) / 2)
             fit = HertzFit(inverse, local, discs)
-            linearise(inverse, [fit])
+            linearise(inverse, fit)
         weights = fit.compute_weights(cubes)
 
         by_pad = inverse.by_pad[cubes]

@@ -32,7 +32,7 @@ from cube_tensor_driver.core.rows import FrequencyRows, StressRows
 from cube_tensor_driver.core.status import STAMP
 
 NATIVE = ROOT / "native"
-SOURCES = [NATIVE / "cube_scan.c", ROOT / "test" / "scan_process.c"]
+SOURCES = [NATIVE / "cube_scan.c", NATIVE / "cube_contact.c", ROOT / "test" / "scan_process.c"]
 STRICT = [
     "-std=c11",
     "-Wall",

@@ -300,7 +300,7 @@ class ContactTracker:
         due = [fit for fit in hertz_fits if fit.needs_linearisation]
         for one in due:
             one.values.refresh_if_stale()
-        linearise(self._inverse, due)
+            linearise(self._inverse, one)
         if len(fitted) > 1:
             update_responses(self._inverse, fitted, self._fitted_cubes)
         total, deviation = self._sum_responses(self._fitted_cubes)
@@ -362,7 +362,7 @@ class ContactTracker:
             is_first = False
             improved = [number]
             if work == Work.BEGIN:
-                # Many fits that begin together take little longer than one.
+                # Fits that begin together need the responses to other regions only once.
                 one_ms = region.estimate_ms(work)
                 begun = [k for k, (other, _) in enumerate(order) if other == Work.BEGIN]
                 begun.sort(key=order.__getitem__)

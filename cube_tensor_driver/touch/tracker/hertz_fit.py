@@ -18,17 +18,16 @@ interpolation, Neural Computation 4 (1992) 415 (evidence).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from ...core.arrays import Array, Index
-from ...core.modes import STRESS
 from ...mechanics.contact_response import DISC_SIZES
 from ...mechanics.sensitivity import DEPTH_DEVIATION
 from ..inverse import SurfaceInverse
 from .contact_estimate import ContactEstimate, ContactSum, Discs
+from .hertz_response import FLATNESS_STEP, N_PARAMETERS, differentiate
 from .local_values import LocalValues, make_rotations_about_normal
 
 SIZE_DEVIATION = 1.0
@@ -41,16 +40,6 @@ surface. The logarithm of the radius has a normal prior distribution."""
 FORCE_DEVIATION = 1e2
 """Prior standard deviation of each component of the force of a contact, in N; the prior mean is 0.
 The value is so large that the prior does not influence the fitted force."""
-
-FLATNESS_STEP = 0.2
-"""Difference h of the natural logarithms of radii in the definition of the flatness, a parameter of
-the pressure distribution of a contact.
-
-To a Hertz contact of radius a, the flatness adds a multiple of the following difference: this
-contact minus a mixture of Hertz contacts of the radii a exp(h) and a exp(-h) with the same force,
-centre and second moment. This moves pressure from the centre to the rim. A Hertz contact has
-flatness 0, a rigid flat punch flatness 1.
-"""
 
 SHAPE_CUBES = 9
 """Number of cubes nearest to the contacts whose residuals test whether the contacts have the shape
@@ -83,10 +72,6 @@ values of the same scan, from a response that is linearised at the new contacts.
 _MAX_STEP = 0.5
 """Largest Gauss-Newton step: shift of a contact divided by the depth of the cubes' centres, and
 change of the natural logarithm of its radius."""
-
-_N_PARAMETERS = 8
-"""Number of parameters of a contact: force f_x, f_y, f_z, centre c_x, c_y, logarithm ln a of the
-radius, flatness, and moment about z."""
 
 _STENCIL = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], float)
 """Shifts (5, 2) of a contact for numerical derivatives by its centre, in units of the step: none,
@@ -358,7 +343,7 @@ class HertzFit:
     def _contact_changes(self) -> Array:
         """Changes (J, 8) of the parameters of the contacts by the last step."""
         n_parameters = len(self.contact_precision)
-        return self._changes[:n_parameters].reshape(-1, _N_PARAMETERS)
+        return self._changes[:n_parameters].reshape(-1, N_PARAMETERS)
 
     def compute_weights(self, cubes: Index) -> Array:
         """Return the derivatives of force and position of the first contact by the values of cubes.
@@ -437,7 +422,7 @@ class HertzFit:
         # `slopes` are the derivatives (J, 8, 3, 7) of the forces of the seven contacts by the eight
         # parameters. A moment of 1 N m is that of half the derivative by x as forces along y, and
         # minus half the derivative by y as forces along x.
-        slopes = np.zeros((len(places), _N_PARAMETERS, 3, 7))
+        slopes = np.zeros((len(places), N_PARAMETERS, 3, 7))
         slopes[:, :3] = np.eye(3)[:, :, None] * patterns[0]
         slopes[:, 3:7] = patterns[1:, None] * self.found.forces[:, None, :, None]
         slopes[:, 7, 1] = patterns[1] / 2
@@ -448,7 +433,7 @@ class HertzFit:
         # Errors of different contacts of a region are treated as independent here.
         roots = np.linalg.cholesky(self._covariances)
         by_contact = np.einsum("jpak,jpm->jakm", slopes, roots)
-        root = np.zeros((3, len(places), 7, len(places), _N_PARAMETERS))
+        root = np.zeros((3, len(places), 7, len(places), N_PARAMETERS))
         for j, own in enumerate(by_contact):
             root[:, j, :, j] = own
         return ContactSum(
@@ -462,8 +447,8 @@ class HertzFit:
     def _covariances(self) -> list[Array]:
         """Covariance (8, 8) of the parameters of each contact."""
         covariance = self.inflation * self.linear.covariance
-        starts = range(0, len(self.contact_precision), _N_PARAMETERS)
-        blocks = [slice(start, start + _N_PARAMETERS) for start in starts]
+        starts = range(0, len(self.contact_precision), N_PARAMETERS)
+        blocks = [slice(start, start + N_PARAMETERS) for start in starts]
         return [covariance[block, block] for block in blocks]
 
     def estimate_contacts(self) -> list[ContactEstimate]:
@@ -494,132 +479,47 @@ class HertzFit:
         return estimates
 
 
-def linearise(inverse: SurfaceInverse, fits: Sequence[HertzFit]) -> None:
-    """Linearise the response of the cubes at the contacts of each fit, for its next step.
-
-    All fits with the same numbers of contacts and cubes together take little longer than one.
+def linearise(inverse: SurfaceInverse, fit: HertzFit) -> None:
+    """Linearise the response of the cubes at the contacts of a fit, for its next step.
 
     Args:
         inverse: Responses (stress in the skin under contacts of unit force).
-        fits: Fits, whose attribute `linear` is set. The steps need values that are whitened with
+        fit: The fit, whose attribute `linear` is set. The steps need values that are whitened with
             the same noise, so the noise is not refreshed here.
     """
-    by_shape: dict[tuple[int, int], list[HertzFit]] = {}
-    for fit in fits:
-        n_contacts = len(fit.found.forces)
-        shape = n_contacts, len(fit.values.cubes)
-        by_shape.setdefault(shape, []).append(fit)
-    for (contacts, cubes), alike in by_shape.items():
-        _linearise_alike(inverse, alike, contacts, cubes)
-
-
-def _linearise_alike(
-    inverse: SurfaceInverse,
-    fits: list[HertzFit],
-    contacts: int,
-    cubes: int,
-) -> None:
-    """Linearise the values of the cubes in the parameters of each of K fits (`Linearisation`).
-
-    The fits have equal numbers of contacts and cubes, so that one call computes all responses.
-
-    Args:
-        inverse: Responses (stress in the skin under contacts of unit force).
-        fits: The K fits, whose attribute `linear` is set.
-        contacts: Number J of contacts of each fit.
-        cubes: Number n of cubes of each fit.
-    """
-    n_fits = len(fits)
-    shape = n_fits, contacts, cubes
-    forces = np.array([fit.found.forces for fit in fits])
-    centres = np.array([fit.found.centres for fit in fits])
-    log_sizes = np.array([fit.found.log_sizes for fit in fits])
-    place = np.array([fit.values.place for fit in fits])
-    angle = np.array([fit.values.angle for fit in fits])
-    variant = np.array([fit.values.variant for fit in fits])
-    offset = place[:, None] - centres[:, :, None]
-
-    # The responses are computed for all fits, contacts and cubes in one call.
-    response = inverse.contact_response
-    positions = offset.reshape(-1, 2)
-    angles = angle.repeat(contacts, axis=0).ravel()
-    variants = variant.repeat(contacts, axis=0).ravel()
-    all_sizes = np.exp(log_sizes).ravel().repeat(cubes)
-    all_forces = forces.reshape(-1, 3).repeat(cubes, axis=0)
-    slopes = response.compute_response_slopes(
-        positions,
-        angles,
-        variants,
-        all_sizes,
-        all_forces,
-    )
-    # The response is not linear in the depth. Its change from the stated depth to the one found
-    # follows from the derivative halfway between these two depths. In a half space, this derivative
-    # is that at the stated depth for a load whose lengths are divided by `halfway`, times a factor.
-    # The factor is the same for all values, so it only scales the error that the next step finds.
-    depth_errors = np.array([fit.depth_error for fit in fits])
-    halfway = np.repeat(1 + depth_errors / 2, contacts * cubes)
-    sensitivity = response.compute_sensitivity(
-        positions / halfway[:, None],
-        angles,
-        all_sizes / halfway,
-        all_forces,
-    )
-    sensitivity[:, :, len(STRESS) :] /= halfway[:, None, None]
-
-    # The derivative by the flatness is the response to a contact minus that to a mixture of a wider
-    # and a narrower one (see `FLATNESS_STEP`, h). With the derivatives `first` and `second` by the
-    # logarithm of the radius, it is h^2 (first - second / 2), to order h^2.
-    first, second = slopes[:, 5], slopes[:, 6]
-    slopes[:, 6] = FLATNESS_STEP**2 * (first - second / 2)
-
-    # The values are the last column beside the derivatives, so that one product whitens both.
-    quantities = sensitivity.shape[1]
-    n_contact_parameters = _N_PARAMETERS * contacts
-    n_parameters = n_contact_parameters + quantities
-    columns = np.empty((n_fits, cubes, len(inverse.columns), n_parameters + 1))
-    by_contact = inverse.select(slopes).reshape(*shape, _N_PARAMETERS, -1)
-    of_contacts = by_contact.transpose(0, 2, 4, 1, 3)
-    columns[..., :n_contact_parameters] = of_contacts.reshape(*columns.shape[:3], -1)
-    by_elastomer = inverse.select(sensitivity).reshape(*shape, quantities, -1).sum(axis=1)
-    columns[..., n_contact_parameters:n_parameters] = by_elastomer.swapaxes(2, 3)
-    by_force = columns[..., :n_contact_parameters].reshape(
-        *columns.shape[:3],
+    contacts, values = fit.found, fit.values
+    columns, white = differentiate(
+        inverse,
+        values.place,
+        values.angle,
+        values.variant,
         contacts,
-        -1,
+        fit.depth_error,
+        values.whitening,
     )
-    columns[..., -1] = np.einsum("kncjp,kjp->knc", by_force[..., :3], forces)
-    whitening = np.array([fit.values.whitening for fit in fits])
-    white = (whitening @ columns).reshape(n_fits, -1, n_parameters + 1)
-    jacobian = white[..., :-1]
+    white = white.reshape(-1, columns.shape[2])
+    jacobian = white[:, :-1]
 
-    precision = np.empty((n_fits, n_parameters))
-    precision[:, :n_contact_parameters] = fits[0].contact_precision
-    precision[:, n_contact_parameters:] = [[fit.elastomer_precision] for fit in fits]
+    precision = np.full(jacobian.shape[1], fit.elastomer_precision)
+    n_contact_parameters = len(fit.contact_precision)
+    precision[:n_contact_parameters] = fit.contact_precision
     prior_offset = np.zeros_like(precision)
-    from_median = prior_offset[:, :n_contact_parameters].reshape(
-        n_fits,
-        contacts,
-        -1,
+    from_median = prior_offset[:n_contact_parameters].reshape(-1, N_PARAMETERS)
+    from_median[:, :3] = contacts.forces
+    from_median[:, 5] = contacts.log_sizes - math.log(USUAL_SIZE * inverse.depth)
+    information = jacobian.T @ jacobian + np.diag(precision)
+    offset = values.place - contacts.centres[:, None]
+    squared_distance = (offset**2).sum(axis=2).min(axis=0)
+    fit.linear = Linearisation(
+        contacts=contacts,
+        cubes=values,
+        values=columns[..., -1],
+        derivatives=columns[..., :-1],
+        white_values=white[:, -1],
+        jacobian=jacobian,
+        offset=prior_offset,
+        precision=precision,
+        information=information,
+        covariance=np.linalg.inv(information),
+        nearest=squared_distance.argsort(kind="stable")[:SHAPE_CUBES],
     )
-    from_median[:, :, :3] = forces
-    from_median[:, :, 5] = log_sizes - np.log(USUAL_SIZE * inverse.depth)
-    information = jacobian.swapaxes(1, 2) @ jacobian
-    np.einsum("kpp->kp", information)[:] += precision
-    covariance = np.linalg.inv(information)
-    squared_distance = (offset**2).sum(axis=3).min(axis=1)
-    nearest = squared_distance.argsort(axis=1, kind="stable")[:, :SHAPE_CUBES]
-    results = zip(
-        columns[..., -1],
-        columns[..., :-1],
-        white[..., -1],
-        jacobian,
-        prior_offset,
-        precision,
-        information,
-        covariance,
-        nearest,
-        strict=True,
-    )
-    for fit, result in zip(fits, results, strict=True):
-        fit.linear = Linearisation(fit.found, fit.values, *result)

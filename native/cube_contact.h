@@ -1,0 +1,67 @@
+// Copyright 2026 cube_tensor_driver authors
+// SPDX-License-Identifier: Apache-2.0
+
+/* Values of cubes under Hertz contacts on the surface, and their derivatives by the contacts.
+ *
+ * The readable specification in numpy is mechanics/contact_response.py for the responses and
+ * touch/tracker/hertz_fit.py for the rest; a test compares both. They add the terms of sums in other
+ * orders, so that their results differ by rounding errors.
+ *
+ * The same bits on every processor, as in cube_scan.h, except that sines, cosines and logarithms are those
+ * of the C library. No heap, no system, no state of its own. */
+#ifndef CUBE_CONTACT_H
+#define CUBE_CONTACT_H
+
+#include "cube_scan.h"
+
+#define CUBE_CONTACT_LANES 16 /* circular components, or outputs, that are computed side by side */
+#define CUBE_CONTACT_BLOCK 4  /* parameters whose derivatives are whitened side by side */
+#define CUBE_CONTACT_ORDERS 9 /* `N_ORDERS` of touch/pad_measurement.py */
+
+/* Arrays of a call: type, name, kind (of numpy), shape, use. The first seven are tables of the skin
+ * (`ContactResponse.collect_tables`). `cube_respond` uses the arrays up to `result`, and `cube_linearise`
+ * all but `result`.
+ * Letters of a shape: R radii, D distances, M circular components (a multiple of 16), O 16 components or
+ * outputs, T radial functions, V variants, N cubes, J contacts, C measured components, P parameters and one
+ * column for the values (a multiple of 4). */
+#define CUBE_CONTACT_ARRAYS(X)                         \
+    X(const double, scale, 'f', "5", INPUT)            \
+    X(const float, response, 'f', "RD3M", INPUT)       \
+    X(const int64_t, order, 'i', "M", INPUT)           \
+    X(const float, matrix, 'f', "V2MO", INPUT)         \
+    X(const float, change, 'f', "RDTO", INPUT)         \
+    X(const int64_t, change_order, 'i', "O", INPUT)    \
+    X(const float, change_matrix, 'f', "2OO", INPUT)   \
+    X(const double, place, 'f', "N2", INPUT)           \
+    X(const double, angle, 'f', "N", INPUT)            \
+    X(const int64_t, variant, 'i', "N", INPUT)         \
+    X(const double, force, 'f', "J3", INPUT)           \
+    X(const double, centre, 'f', "J2", INPUT)          \
+    X(const double, log_size, 'f', "J", INPUT)         \
+    X(double, result, 'f', "NC", STATE)                \
+    X(const double, whitening, 'f', "NCC", INPUT)      \
+    X(double, columns, 'f', "NCP", RESULT)             \
+    X(double, white, 'f', "NCP", RESULT)
+
+typedef struct {
+    CUBE_CONTACT_ARRAYS(CUBE_SCAN_FIELD)
+    int64_t length[sizeof CUBE_SCAN_LETTERS];
+} cube_contact_call;
+
+#define CUBE_RESPOND_N_ARRAYS 14
+#define CUBE_CONTACT_N_ARRAYS 17
+extern const cube_scan_array cube_contact_arrays[CUBE_CONTACT_N_ARRAYS];
+
+/* Returns a call without arrays. */
+cube_contact_call cube_contact_begin(void);
+
+/* Computes the values of the cubes, summed over the contacts. Returns false if the arrays do not fit
+ * together. The numbers in `variant` are not checked. */
+bool cube_respond(const cube_contact_call *call);
+
+/* Computes the derivatives of the values by the parameters, and then the values, in `columns`, and whitens
+ * them (`_linearise_in_numpy`, which explains `halfway`). Returns false if the arrays do not fit together.
+ * The numbers in `variant` are not checked. */
+bool cube_linearise(const cube_contact_call *call, double halfway);
+
+#endif
