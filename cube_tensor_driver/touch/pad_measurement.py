@@ -84,10 +84,9 @@ def model_pads(
         ElasticError: The influence functions belong to a cube of another size, or there is none
             for a pad of a calibration.
     """
-    # Cubes with the same calibration file share one `Calibration` object, so that the different
-    # calibrations are found by identity.
-    variants = list({id(one): one for one in calibrations}.values())
-    variant_numbers = {id(one): number for number, one in enumerate(variants)}
+    # Cubes with the same calibration file share one `Calibration`. They are compared by identity.
+    variants = list(dict.fromkeys(calibrations))
+    variant = np.array([variants.index(one) for one in calibrations], np.intp)
     spectra, all_pads = _load_decomposition(influence)
 
     by_pad = compute_noise_of_all_pads(variants)
@@ -97,7 +96,6 @@ def model_pads(
         own[:, : matched.shape[1]] = matched / calibration.noise
     # Circular components yield the stresses of the pads, and these the measured components.
     components = pads @ np.nan_to_num(by_pad).swapaxes(1, 2)
-    variant = np.array([variant_numbers[id(one)] for one in calibrations], np.intp)
     return MeasurementModel(spectra, components, variant, pads)
 
 
