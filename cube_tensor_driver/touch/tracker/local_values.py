@@ -244,8 +244,8 @@ class LocalValues:
     @property
     def has_same_values(self) -> bool:
         """Whether the known components of the cubes are the same as at the last `refresh`."""
-        known = self._noise.known[self.cubes]
-        return np.array_equal(self.known, known)
+        known = self._noise.known.take(self.cubes, axis=0)
+        return bool((self.known == known).all())
 
     def whiten(self, scaled: Array, others: Array | float) -> Array:
         """Return the values (n C,) of these cubes, transformed so that their noise has variance 1.

@@ -342,9 +342,9 @@ class TrackedRegion:
         values = fit.values
         if self._compared_others is not self.others:
             self._compared_others = self.others
-            change = np.broadcast_to(self.others - self._fitted_others, values.known.shape)
-            white = values.whitening @ change[:, :, None]
-            self._others_change = float((white**2).sum())
+            change = self.others - self._fitted_others
+            white = (values.whitening @ change[:, :, None]).ravel()
+            self._others_change = float(white @ white)
         return self._others_change > MAX_OTHERS_CHANGE * values.count
 
     def _follow_home(self, fit: HertzFit) -> None:
