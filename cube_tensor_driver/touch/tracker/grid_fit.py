@@ -313,6 +313,10 @@ class GridFit:
                 transformed by `LocalValues.whiten` so that their noise has variance 1.
         """
         whitening = self.values.whitening
+        # Rows of unknown components are 0, so 1 on the diagonal makes the matrices invertible.
+        is_unknown = ~self.values.known
+        invertible = whitening + is_unknown[:, :, None] * np.eye(is_unknown.shape[1])
+        self._unwhitening = np.linalg.inv(invertible)
         white_response = whitening @ self._response.reshape(*whitening.shape[:2], -1)
         self._white_response = white_response.reshape(len(white), 3, -1)
         equal_envelope = np.ones(len(self.places))
@@ -353,8 +357,7 @@ class GridFit:
         forces = self._decomposition.basis @ (best.variances * projected)
         self.forces = forces.reshape(3, -1)
         # Errors of the elastomer change the values of the new forces differently.
-        self._sensitivity = self._compute_sensitivity()
-        white = self.values.whitening @ self._sensitivity
+        white = self.values.whitening @ self._compute_sensitivity()
         self._white_sensitivity = white.reshape(-1, white.shape[2])
         self._condition(columns[:, 0])
         self._separate_contacts()
@@ -373,9 +376,9 @@ class GridFit:
         unknowns = posterior.shrinkage * (projected - posterior.by_errors @ self._errors)
         self.forces = (posterior.to_forces @ unknowns).reshape(3, -1)
 
-        residual = white - unknowns.astype(np.float32) @ posterior.response
-        residual -= self._white_sensitivity[:, 1:] @ self._errors
-        deviations = np.concatenate([residual, unknowns, self._errors])
+        by_forces = unknowns.astype(np.float32) @ posterior.response
+        self._explained = by_forces + self._white_sensitivity[:, 1:] @ self._errors
+        deviations = np.concatenate([white - self._explained, unknowns, self._errors])
         chi_squared = float(deviations @ deviations)
         count = self.values.count
         self.misfit = max(chi_squared / count, 1.0)
@@ -384,10 +387,10 @@ class GridFit:
 
     @property
     def explained(self) -> Array:
-        """Components (n, C), in Pa, that the forces cause in the cubes around the region."""
-        by_errors = self._sensitivity[:, :, 1:] @ self._errors
-        by_forces = self._response @ self.forces.ravel().astype(np.float32)
-        return np.asarray(by_forces.reshape(by_errors.shape) + by_errors)
+        """Components (n, C), in Pa, that the forces cause in the cubes around the region; 0 where
+        the component is unknown."""
+        whitened = self._explained.reshape(*self.values.known.shape, 1)
+        return np.asarray((self._unwhitening @ whitened)[:, :, 0])
 
     @property
     def discs(self) -> Discs:

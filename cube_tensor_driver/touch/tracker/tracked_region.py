@@ -224,7 +224,6 @@ class TrackedRegion:
         self.peak = 0.0
         self.near: list[TrackedRegion] = []
         self.fit: HertzFit | GridFit | None = None
-        self.others: Array | float = 0.0
         self.gap = np.inf
         n_cubes = len(inverse.variant)
         self.response = np.zeros((n_cubes, len(inverse.columns)))
@@ -235,9 +234,9 @@ class TrackedRegion:
         self._respond = respond
         self._fitted_points = self.points
         self._fitted_peak = 0.0
-        self._fitted_others: Array | float = 0.0
+        self._fitted_others: Array
         # `_others_change` is the sum of squares for `MAX_OTHERS_CHANGE`, for `_compared_others`.
-        self._compared_others: Array | float | None = None
+        self._compared_others: Array | None = None
         self._others_change = 0.0
         self._first_misfit = 1.0
         self._is_direct = inverse.pitch < MAX_DIRECT_PITCH * inverse.depth
@@ -247,6 +246,7 @@ class TrackedRegion:
         self._bad_scans = 0
         self._steps = 0
         self.integral: ContactEstimate
+        self.others: Array
         # `_checked` are the contacts that `find_stale_cubes` has compared last.
         self._checked: Discs | None = None
         self._responded = (
