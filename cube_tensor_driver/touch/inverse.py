@@ -9,7 +9,6 @@ posterior of t, prediction.py replaces values that are missing.
 
 from __future__ import annotations
 
-from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -216,9 +215,7 @@ class SurfaceInverse:
             raise ElasticError(f"{side} points a side of a patch; it must be at least 1")
         n = len(poses.position)
         self.revision = 0
-        # The whole skin is laid flat at once and kept, because contacts stay at few cubes.
-        everything = np.arange(n)[None]
-        self._unroll_skin = cache(lambda centre: unroll(poses, np.array([centre]), everything))
+        self._unrolled: dict[int, tuple[Array, Array]] = {}
         self.poses = poses
         self.depth = depth
         self.pitch = poses.pitch
@@ -294,7 +291,11 @@ class SurfaceInverse:
             Positions (n, 2) in m and rotations (n,) about z in rad of these cubes, in the frame of
             the centre cube.
         """
-        place, angle = self._unroll_skin(centre)
+        # The whole skin is laid flat at once and kept, because contacts stay at few cubes.
+        if centre not in self._unrolled:
+            everything = np.arange(len(self.poses.position))
+            self._unrolled[centre] = unroll(self.poses, np.array([centre]), everything[None])
+        place, angle = self._unrolled[centre]
         return place[0, cubes], angle[0, cubes]
 
     def leave_out(self, cubes: Index, by_pad: Array) -> None:
