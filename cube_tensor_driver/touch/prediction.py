@@ -39,6 +39,8 @@ class CubePrediction:
         self._cube = cube
         self._near = windows.inner[cube]
         self._columns = np.flatnonzero(missing[cube])
+        # The windows that contain the cube, and its place in the list of cubes of each of them.
+        self._rows, self._place = np.nonzero(windows.near == cube)
         precision = windows.matrices.precision[windows.kind[cube]].astype(float)
         is_missing = missing[self._near].ravel()
         # A window lists its centre cube first, so the first missing values are those of this cube.
@@ -65,15 +67,17 @@ class CubePrediction:
         """
         # The values from which the missing ones are predicted contain the noise of their pads.
         near = self._near
-        weights = self._weights.reshape(len(self._weights), len(near), 1, -1)
-        by_pad = (weights @ self._windows.pads[near]).reshape(len(weights), -1)
-        noise = by_pad * pad_variance[near].ravel() @ by_pad.T
+        pads = self._windows.pads[near]
+        n, width = len(self._columns), pads.shape[1]
+        by_pad = self._weights.reshape(n, -1, width).swapaxes(0, 1) @ pads
+        weighted = by_pad * pad_variance[near, None]
+        noise = (weighted @ by_pad.swapaxes(1, 2)).sum(axis=0)
 
-        windows, place = np.nonzero(self._windows.near == self._cube)
-        columns = place[:, None] * weights.shape[3] + self._columns
-        kinds = self._windows.kind[windows]
+        rows = self._rows
+        columns = self._place[:, None] * width + self._columns
+        kinds = self._windows.kind[rows]
         gain = self._windows.matrices.gain[kinds[:, None], :, 2:, columns]
         gain = gain.reshape(*columns.shape, -1)
-        covariance = scale[windows, None, None] * self._covariance + noise
+        covariance = scale[rows, None, None] * self._covariance + noise
         increase = (gain * (covariance @ gain)).sum(axis=1)
-        variance[windows] += increase.reshape(-1, *variance.shape[1:])
+        variance[rows] += increase.reshape(-1, *variance.shape[1:])
