@@ -193,12 +193,7 @@ class Touch:
             ElasticError: The elastomer of the skin file is impossible.
         """
         allowed = "a number above 0, per hour"
-        check_number(
-            "false_alarms",
-            false_alarms,
-            lambda x: 0 < x < math.inf,
-            allowed,
-        )
+        check_number("false_alarms", false_alarms, lambda x: 0 < x < math.inf, allowed)
         skin = as_skin(skin)
         n = len(skin.calibrations)
         rate_hz = max(skin.rate or 0.0, MIN_RATE_HZ)
@@ -208,26 +203,20 @@ class Touch:
         self.limit = max(0.0, limit - OVERSHOOT)
 
         self._pipeline = Pipeline(skin.calibrations)
-        covariances = [self._pipeline.compute_covariance(cube) for cube in range(n)]
-        covariance = np.array(covariances)
+        covariance = np.array([self._pipeline.compute_covariance(cube) for cube in range(n)])
         variance = np.diagonal(covariance, axis1=1, axis2=2)
-        pressure_variance = variance[:, PRESSURE]
         self._unobserved = np.isnan(variance)
-        self._deviation = np.sqrt(pressure_variance)
+        self._deviation = np.sqrt(variance[:, PRESSURE])
         poses = skin.poses
         self._place = poses.position / poses.pitch
         near = find_nearest_cubes(poses, NEIGHBOURS)
         self._estimate = None
         if skin.elastomer is not None:
-            self._estimate = estimate_forces(
-                poses,
-                skin.elastomer,
-                near,
-                covariance,
-            )
+            self._estimate = estimate_forces(poses, skin.elastomer, near, covariance)
 
         # The largest value among the neighbours is found faster if they are the first axis.
         self._near = near.T.copy()
+        self._every_cube = np.arange(n)
         self._find_errors = find_errors
         self._errors = np.zeros((0, NEIGHBOURS, len(COMPONENTS), 0))
         self._errors_cube = np.zeros(0, np.intp)
@@ -260,7 +249,7 @@ class Touch:
         not change, so that touches continue. New touches are only found after `SETTLING_ROWS`
         samples.
         """
-        self._restart(np.arange(len(self._sum)))
+        self._restart(self._every_cube)
 
     def update(self, rows: StressRows) -> list[Touches]:
         """Find the touches in rows (samples of one cube each).
@@ -349,12 +338,7 @@ class Touch:
             covariance = self._pipeline.compute_covariance(cube, mask)
             self._deviation[cube] = np.sqrt(covariance[PRESSURE, PRESSURE])
 
-    def _compute_gain(
-        self,
-        cube: Index | slice,
-        pressure: Array,
-        elapsed_s: Array,
-    ) -> Array:
+    def _compute_gain(self, cube: Index | slice, pressure: Array, elapsed_s: Array) -> Array:
         """Return the gain (k,) of the low-pass filter that gives the slow parts of k cubes.
 
         `_test` has to be called before, with the same arguments.
@@ -364,8 +348,7 @@ class Touch:
             part; 0 where the slow part is held.
         """
         if not self._touched.any():
-            release = -MIN_RELEASE * self._deviation[cube]
-            has_gone = pressure < release
+            has_gone = pressure < -MIN_RELEASE * self._deviation[cube]
             self._count[cube] *= ~has_gone
         # With the gain 1 / n of the n-th sample, the slow part is the mean of the first samples.
         mean_gain = 1 / (self._count[cube] + 1)
@@ -373,12 +356,7 @@ class Touch:
         is_kept = self._held | self._touched
         return np.where(is_kept[cube], 0, gain)
 
-    def _test(
-        self,
-        cube: Index | slice,
-        pressure: Array,
-        elapsed_s: Array,
-    ) -> None:
+    def _test(self, cube: Index | slice, pressure: Array, elapsed_s: Array) -> None:
         """Add the pressures of k cubes to their CUSUM sums, and find which cubes are touched.
 
         Args:
@@ -397,20 +375,16 @@ class Touch:
             margin = np.where(self._held[cube], growing, fading)
             self._margin[cube] = margin
 
-        before = self._sum[cube]
         # The slow part of a pressure that drifts steadily lags behind by one time constant. The
         # largest difference that drift causes is subtracted.
         lag = MAX_DRIFT * TIME_CONSTANT_S
-        excess = pressure - margin - lag
-        score = excess / self._deviation[cube]
+        score = (pressure - margin - lag) / self._deviation[cube]
+        before = self._sum[cube]
         # The sum is limited from above, so that it falls to 0 within a few scans after any load.
-        largest_sum = self.limit + REFERENCE
-        after = before + score - REFERENCE
-        after = after.clip(0, largest_sum)
+        after = (before + score - REFERENCE).clip(0, self.limit + REFERENCE)
         is_settling = self._count[cube] < SETTLING_ROWS
         after = np.where(is_settling, before, after)
-        is_unknown = np.isnan(pressure)
-        self._sum[cube] = np.where(is_unknown, 0, after)
+        self._sum[cube] = np.where(np.isnan(pressure), 0, after)
 
         begins = self._sum > self.limit
         lasts = self._touched & (self._sum > 0)
@@ -432,38 +406,27 @@ class Touch:
             return NO_TOUCHES._replace(stamp_ns=stamp_ns)
         pressure = -self._change[:, PRESSURE]
         strength = np.where(self._touched, pressure, 0)
-        neighbours = strength[self._near].max(axis=0)
-        is_largest = self._touched & (strength >= neighbours)
+        # `top` is the neighbour of each cube with the largest pressure, or the cube itself.
+        largest = strength[self._near].argmax(axis=0)
+        top = self._near[largest, self._every_cube]
+        is_largest = self._touched & (top == self._every_cube)
         # In each scan, the upper limit of the pressure spreads to the neighbours of a cube. This is
         # fast enough: slow parts change little in the scans until the limit has reached all cubes.
-        reach_around = self._reach[self._near].max(axis=0)
-        spread = SPREAD * reach_around
-        distant_pressure = MAX_DISTANT_RATIO * strength.max()
-        felt = np.maximum(spread, distant_pressure)
-        is_own = strength > felt
+        spread = SPREAD * self._reach[self._near].max(axis=0)
+        felt = np.maximum(spread, MAX_DISTANT_RATIO * strength.max())
         self._reach = np.maximum(strength, spread)
         self._held = self._reach > self._deviation / 2
 
-        cube = np.flatnonzero(is_largest & is_own)
-        order = np.argsort(-pressure[cube], kind="stable")
-        cube = cube[order]
-        number = self._number(cube, strength, stamp_ns)
+        cube = np.flatnonzero(is_largest & (strength > felt))
+        cube = cube[np.argsort(-pressure[cube], kind="stable")]
+        number = self._number(cube, top, stamp_ns)
         own = pressure[cube]
         margin = self._margin[cube]
-        gain_deviation = GAIN_ERROR * own
-        variance = self._deviation[cube] ** 2
-        variance += margin**2
-        variance += gain_deviation**2
         errors = self._update_errors(cube, stamp_ns)
-        own_errors = errors[:, 0, PRESSURE]
-        variance += (own_errors**2).sum(axis=1)
-        share = margin / np.maximum(own, 1e-9)
-        share = np.clip(share, 0, 1)
-        force, force_deviation = self._estimate_forces(
-            cube,
-            share[:, None],
-            errors,
-        )
+        variance = self._deviation[cube] ** 2 + margin**2 + (GAIN_ERROR * own) ** 2
+        variance += (errors[:, 0, PRESSURE] ** 2).sum(axis=1)
+        share = np.clip(margin / np.maximum(own, 1e-9), 0, 1)
+        force, force_deviation = self._estimate_forces(cube, share[:, None], errors)
         return Touches(
             stamp_ns=stamp_ns,
             cube=cube,
@@ -474,7 +437,7 @@ class Touch:
             force_uncertainty=force_deviation,
         )
 
-    def _number(self, cube: Index, strength: Array, stamp_ns: int) -> Index:
+    def _number(self, cube: Index, top: Index, stamp_ns: int) -> Index:
         """Return the numbers (m,) of the touches of this scan.
 
         Each touched cube belongs to the touch that is reached by going repeatedly to the neighbour
@@ -483,25 +446,23 @@ class Touch:
 
         Args:
             cube: Indices (m,) of the cubes of the touches, the one with the largest pressure first.
-            strength: Pressure (cubes,) of the touched cubes, 0 elsewhere.
+            top: Index (cubes,) of the neighbour with the largest pressure of each cube.
             stamp_ns: Time of the earliest sample of the scan, in ns.
         """
-        number = self._id[cube]
-        _, first = np.unique(number, return_index=True)
-        is_new = number == NO_TOUCH
-        # Of several touches with the same number, the one with the largest pressure keeps it.
-        is_new[np.delete(np.arange(len(cube)), first)] = True
-        number[is_new] = stamp_ns + np.arange(np.count_nonzero(is_new))
+        numbers: list[int] = []
+        new = stamp_ns
+        for number in self._id[cube].tolist():
+            # Of several touches with the same number, the one with the largest pressure keeps it.
+            is_new = number == NO_TOUCH or number in numbers
+            numbers.append(new if is_new else number)
+            new += is_new
 
-        every_cube = np.arange(len(strength))
-        largest = strength[self._near].argmax(axis=0)
-        top = self._near[largest, every_cube]
         while (top[top] != top).any():
             top = top[top]
         self._id[~self._touched] = NO_TOUCH
-        self._id[cube] = number
+        self._id[cube] = numbers
         self._id = self._id[top]
-        return number
+        return np.array(numbers, np.intp)
 
     def _update_errors(self, cube: Index, stamp_ns: int) -> Array:
         """Return the errors (m, W, 15, K) of the values of m cubes and their neighbours.
@@ -545,40 +506,28 @@ class Touch:
             return unknown, unknown
         near = self._near[:, cube].T
         kind = estimate.kind[cube]
-        n_values = near.shape[1] * len(COMPONENTS)
-        values = np.nan_to_num(self._change[near])
-        values = values.reshape(len(cube), n_values, 1)
-        terms = values * estimate.weights[kind]
-        square_terms = terms**2
-        force = terms.sum(axis=1)
+        weights = estimate.weights[kind]
+        values = self._change[near].reshape(len(cube), 1, weights.shape[1])
+        values[np.isnan(values)] = 0
+        force = (values @ weights)[:, 0]
         square = force**2
-        total_square = square.sum(axis=1, keepdims=True)
 
         place = self._place[cube]
-        offset = place[:, None] - place
-        pitches = np.linalg.norm(offset, axis=2)
+        squared_distance = ((place[:, None] - place) ** 2).sum(axis=2)
         # The distance of a load from itself is set to infinity, because only other loads disturb
         # the estimate of its force.
-        np.fill_diagonal(pitches, np.inf)
+        np.fill_diagonal(squared_distance, np.inf)
         # The errors due to other loads decrease with the distance^-3, their squares with ^-6.
-        others = pitches**-6
+        others = squared_distance**-3
 
-        squared_error = estimate.error[kind] ** 2
-        lasting_force = share * force
-        variance = estimate.noise[kind] ** 2
-        variance += GAIN_ERROR**2 * square_terms.sum(axis=1)
-        variance += np.einsum("mij,mj->mi", squared_error, square)
-        other_variance = OTHER_LOADS**2 * others @ total_square
-        variance += other_variance
-        variance += lasting_force**2
-        by_value = errors.reshape(len(cube), n_values, errors.shape[3])
-        force_errors = by_value.swapaxes(1, 2) @ estimate.weights[kind]
-        variance += (force_errors**2).sum(axis=1)
+        variance = estimate.noise_variance[kind] + (share * force) ** 2
+        variance += GAIN_ERROR**2 * (values**2 @ weights**2)[:, 0]
+        variance += (estimate.squared_error[kind] @ square[:, :, None])[:, :, 0]
+        variance += OTHER_LOADS**2 * others @ square.sum(axis=1, keepdims=True)
+        by_value = errors.reshape(len(cube), weights.shape[1], errors.shape[3])
+        variance += ((by_value.swapaxes(1, 2) @ weights) ** 2).sum(axis=1)
 
-        is_missing = np.isnan(self._slow[near])
-        is_complete = is_missing == self._unobserved[near]
-        is_unknown = ~is_complete.all(axis=(1, 2))
-        force[is_unknown] = np.nan
-        deviation = np.sqrt(variance)
-        deviation[is_unknown] = np.nan
-        return force, deviation
+        is_missing = np.isnan(self._slow[near]) != self._unobserved[near]
+        is_unknown = is_missing.any(axis=(1, 2))
+        force[is_unknown] = variance[is_unknown] = np.nan
+        return force, np.sqrt(variance)

@@ -60,15 +60,15 @@ class ForceEstimate(NamedTuple):
         kind: Number (cubes,) of the kind of each cube.
         weights: Matrix W (kinds, n 15, 3) from the components, in Pa and Pa/m, to the force on the
             skin along x, y and z of the cube in the middle, in N.
-        noise: Standard deviations (kinds, 3) of the force due to the noise of the pads, in N.
-        error: Root mean square error (kinds, 3, 3) of each component of the estimate (last axis but
-            one) due to the unknown position, for a force of 1 N along x, y and z (last axis).
+        noise_variance: Variances (kinds, 3) of the force due to the noise of the pads, in N^2.
+        squared_error: Mean squared error (kinds, 3, 3) of each component of the estimate (last axis
+            but one) due to the unknown position, for a force of 1 N along x, y and z (last axis).
     """
 
     kind: Index
     weights: Array
-    noise: Array
-    error: Array
+    noise_variance: Array
+    squared_error: Array
 
 
 def estimate_forces(
@@ -100,23 +100,12 @@ def estimate_forces(
     _, noise_kind = np.unique(noise, axis=0, return_inverse=True)
     noise_kind = noise_kind.reshape(n)
     # Poses that differ by less than a micrometre or a tenth of a milliradian count as the same.
-    keys = [
-        place.reshape(n, -1) / 1e-6,
-        angle / 1e-4,
-        noise_kind[near],
-    ]
-    rounded = np.hstack(keys).round()
-    _, first, kind = np.unique(
-        rounded,
-        axis=0,
-        return_index=True,
-        return_inverse=True,
-    )
+    keys = np.hstack([place.reshape(n, -1) / 1e-6, angle / 1e-4, noise_kind[near]]).round()
+    _, first, kind = np.unique(keys, axis=0, return_index=True, return_inverse=True)
 
     own = _make_grid(np.linspace(-MAX_PITCHES, MAX_PITCHES, 9))
     other = _make_grid(np.arange(-5.0, 6.0))
-    is_apart = np.abs(other).max(axis=1) >= MIN_OTHER_PITCHES
-    other = other[is_apart]
+    other = other[np.abs(other).max(axis=1) >= MIN_OTHER_PITCHES]
     sources = poses.pitch * np.concatenate([own, other])
     solved = []
     for cube in first.tolist():
@@ -124,17 +113,9 @@ def estimate_forces(
         offset = place[cube, :, None] - sources
         angles = np.repeat(angle[cube], len(sources))
         signal = response(offset.reshape(-1, 2), angles)
-        signal = signal.reshape(len(window), len(sources), -1, 3)
-        signal = signal.swapaxes(1, 2)
-        estimate = _solve(signal, len(own), covariance[window])
-        solved.append(estimate)
-    weights, deviations, errors = zip(*solved, strict=True)
-    return ForceEstimate(
-        kind=kind.reshape(n),
-        weights=np.array(weights),
-        noise=np.array(deviations),
-        error=np.array(errors),
-    )
+        signal = signal.reshape(len(window), len(sources), -1, 3).swapaxes(1, 2)
+        solved.append(_solve(signal, len(own), covariance[window]))
+    return ForceEstimate(kind.reshape(n), *map(np.array, zip(*solved, strict=True)))
 
 
 def _make_grid(line: Array) -> Array:
@@ -143,12 +124,8 @@ def _make_grid(line: Array) -> Array:
     return np.column_stack([x.ravel(), y.ravel()])
 
 
-def _solve(
-    signal: Array,
-    n_own: int,
-    covariance: Array,
-) -> tuple[Array, Array, Array]:
-    """Compute weights, noise and error (`ForceEstimate`) for one kind of cube.
+def _solve(signal: Array, n_own: int, covariance: Array) -> tuple[Array, Array, Array]:
+    """Return weights, noise variance and squared error (`ForceEstimate`) for one kind of cube.
 
     Args:
         signal: Components (W, 15, S, 3) of W cubes for a force of 1 N at each of S positions.
@@ -163,8 +140,7 @@ def _solve(
     noise[each, :, each] = covariance
     noise = noise[observed][:, observed]
 
-    observed_signal = signal[observed]
-    own, other = np.split(observed_signal, [n_own], axis=1)
+    own, other = np.split(signal[observed], [n_own], axis=1)
     total = FORCE_DEVIATION**2 * _compute_mean_square(own)
     total += OTHER_FORCE_DEVIATION**2 * _compute_mean_square(other)
     total += noise
@@ -174,11 +150,9 @@ def _solve(
     weights[observed] = solution
 
     estimate = np.einsum("cf,csl->sfl", solution, own)
-    error = estimate - np.eye(3)
-    squared_error = (error**2).mean(axis=0)
-    rms_error = np.sqrt(squared_error)
+    squared_error = ((estimate - np.eye(3)) ** 2).mean(axis=0)
     noise_variance = np.einsum("if,ij,jf->f", solution, noise, solution)
-    return weights.reshape(-1, 3), np.sqrt(noise_variance), rms_error
+    return weights.reshape(-1, 3), noise_variance, squared_error
 
 
 def _compute_mean_square(signal: Array) -> Array:

@@ -29,6 +29,7 @@ from cube_tensor_driver.touch.pad_noise import GAIN_ERROR, compute_noise_of_all_
 from cube_tensor_driver.touch.touch_detection import (
     MAX_DRIFT,
     NO_TOUCH,
+    OTHER_LOADS,
     OVERSHOOT,
     REFERENCE,
     Touch,
@@ -271,6 +272,21 @@ def test_stated_deviations_contain_errors_that_all_cubes_have_in_common(make_ski
     force = pattern.T @ weights.reshape(-1, 15, 3).sum(axis=0)
     added = stated.force_uncertainty**2 - plain.force_uncertainty**2
     np.testing.assert_allclose(added[0], (force**2).sum(axis=0), rtol=1e-6)
+
+
+def test_stated_deviations_contain_the_force_of_another_load(make_skin):
+    """Which decreases with the third power of the distance, here four pitches."""
+    skin, found = make_skin(8, known=True), []
+    own, other = skin.poses.position[[17, 21], :2]
+    for force in (0.0, -1.5):
+        run = Run(skin)
+        load = run.ball((0.0, 0.0, -2.0), own) + run.ball((0.0, 0.0, force), other)
+        run.feed(100)
+        found += run.feed(1, load)
+    alone, beside = found
+    assert beside.cube.tolist() == [17, 21]
+    added = beside.force_uncertainty[0] ** 2 - alone.force_uncertainty[0] ** 2
+    np.testing.assert_allclose(added, (OTHER_LOADS * beside.force[1, 2] / 4**3) ** 2, rtol=0.1)
 
 
 def test_several_scans_in_one_call_give_the_same(make_skin):
