@@ -18,7 +18,12 @@ from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.tensor import rotation_from_rpy
 from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.mechanics.layer import Layer
+from cube_tensor_driver.mechanics.measurement_model import CubeMeasurement
+from cube_tensor_driver.mechanics.traction_prior import TractionPrior
 from cube_tensor_driver.touch.inverse import SurfaceInverse
+from cube_tensor_driver.touch.pad_noise import GAIN_ERROR
+from cube_tensor_driver.touch.posterior import MODEL_ERROR
+from cube_tensor_driver.touch.prior import AMPLITUDE
 from cube_tensor_driver.touch.surface import Surface
 
 DEPTH, PITCH, COUNT = 5e-3, 8e-3, 7
@@ -114,6 +119,58 @@ def test_values_that_are_missing_are_those_of_a_skin_without_them(inverse):
     unknown = np.full_like(values, np.nan)
     assert np.abs(inverse.field(unknown).traction).max() == 0
     assert np.isfinite(inverse.deviation(unknown).pressure).all()
+
+
+def test_mean_and_deviation_on_a_small_skin_follow_from_the_formulas():
+    """Nine cubes are one window of which all cubes are inner ones, so all matrices are small."""
+    skin = make_flat_skin(PITCH, 2 * PITCH)
+    noise = 90.0  # Pa; in most values about as much as the gain errors
+    small = SurfaceInverse.from_poses(skin, noise / 3 * pads_noise()[:9], Layer(), DEPTH, side=2)
+    values = noisy(ball(skin, 10e-3, (1e-3, 2e-3)))
+    y = small.scale_values(values).ravel()
+    prior = TractionPrior(CubeMeasurement(Layer(), DEPTH, skin.half_side[0]))
+    place, n_points = skin.position[:, :2], len(small.points)
+
+    first, second = np.divmod(np.arange(81), 9)
+    straight, alike = np.zeros(81), np.zeros(81, int)
+    pairs = place[first] - place[second], straight, alike, straight, alike
+    known = prior.compute_covariance(*pairs).reshape(9, 9, 15, 15).swapaxes(1, 2).reshape(135, 135)
+    apart = (place - small.points[:, None, :2]).reshape(-1, 2)
+    cross = prior.compute_surface_covariance(apart, np.zeros(len(apart)), np.zeros(len(apart), int))
+    cross = AMPLITUDE**2 * cross.swapaxes(1, 2).reshape(n_points, 9, 4, 15).swapaxes(1, 2)
+    cross = cross.reshape(n_points, 4, 135)
+
+    # Each component has a pad of its own, with the same noise in Pa.
+    model_error = MODEL_ERROR**2 * np.diag(np.diag(known))
+    precision = np.linalg.inv(AMPLITUDE**2 * (known + model_error) + noise**2 * np.eye(135))
+    gain = cross @ precision
+    field = small.field(values)
+    found = np.column_stack([field.traction, field.depth_pressure])
+    np.testing.assert_allclose(found, gain @ y, atol=1e-4 * np.abs(found).max())
+
+    errors = noise**2 + (GAIN_ERROR * y) ** 2
+    scale = (y @ precision @ y - np.diag(precision) @ errors) / 135
+    variance = AMPLITUDE**2 * prior.variance - (gain * cross).sum(axis=2)
+    deviation = np.sqrt(scale * variance + gain**2 @ errors)
+    stated = small.deviation(values)
+    np.testing.assert_allclose(stated.pressure, deviation[:, 2], rtol=1e-3)
+    np.testing.assert_allclose(stated.depth_pressure, deviation[:, 3], rtol=1e-3)
+
+
+def test_predictions_on_a_small_skin_lose_nothing():
+    """Missing values are predicted from all others, and give the field of a skin without them."""
+    skin = make_flat_skin(PITCH, 2 * PITCH)
+    values, noise = ball(skin, 10e-3, (1e-3, 2e-3)), pads_noise()[:9]
+    lost = noise.copy()
+    for one in (values, lost):
+        one[[1, 4]], one[7, ACROSS] = np.nan, np.nan
+    field, expected = (
+        SurfaceInverse.from_poses(skin, one, Layer(), DEPTH, side=2).field(values)
+        for one in (noise, lost)
+    )
+    limit = 1e-4 * np.abs(expected.traction).max()
+    np.testing.assert_allclose(field.traction, expected.traction, atol=limit)
+    np.testing.assert_allclose(field.depth_pressure, expected.depth_pressure, atol=limit)
 
 
 def test_cubes_that_are_turned_see_the_same_traction(inverse):
