@@ -91,6 +91,7 @@ class CheckedSubscription:
         self._topic = topic
         self._callback = callback
         self._waiting: bytes | None = None
+        self._is_closed = False
         # The timer runs only during the pause that follows a damaged message.
         self._pause = node.create_timer(LOG_PERIOD_S, self._end_pause)
         self._pause.cancel()
@@ -103,11 +104,15 @@ class CheckedSubscription:
         )
 
     def close(self) -> None:
-        """End the subscription."""
+        """End the subscription. `callback` is not called any more."""
+        self._is_closed = True
         self._node.destroy_subscription(self._subscription)
         self._node.destroy_timer(self._pause)
 
     def _receive(self, data: bytes) -> None:
+        # rclpy also calls with a message that it took just before the subscription was destroyed.
+        if self._is_closed:
+            return
         if self._pause.is_canceled():
             self._decode(data)
         else:

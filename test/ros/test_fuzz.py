@@ -163,6 +163,7 @@ def test_many_bad_messages_are_one_line_and_the_newest_good_one_is_taken(ros, ca
     sender.publish(SkinInfo(name="last"))
     ros.wait(lambda: len(got) == 2)
     taken.close()
+    taken._receive(serialize_message(SkinInfo(name="taken just before")))
     lines = capfd.readouterr().err.splitlines()
     assert [info.name for info in got] == ["first", "last"]
     assert 1 <= len(lines) <= 3 and any("info: failed to deserialize" in line for line in lines)
