@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,6 +82,12 @@ It is larger than any other entry, so that the entries stay in rising order.
 UNKNOWN = np.iinfo(np.uint16).max
 """Cube number that replaces all numbers below 0 or above 65534, because the kernel (the loop over
 rows) takes numbers of 16 bits. No skin has a cube with this number."""
+
+_calibrations: WeakValueDictionary[str, Calibration] = WeakValueDictionary()
+"""Calibration that all pipelines of the process use, by its id (hash of the content).
+
+If a skin file is read again, its estimators are found in the cache.
+"""
 
 
 @lru_cache(maxsize=MAX_CACHED_ESTIMATORS)
@@ -161,7 +168,9 @@ class Pipeline:
             return_index=True,
             return_inverse=True,
         )
-        self._groups = tuple(calibrations[cube] for cube in first.tolist())
+        self._groups = tuple(
+            _calibrations.setdefault(ids[cube], calibrations[cube]) for cube in first.tolist()
+        )
         self.calibrations = tuple(self._groups[number] for number in group.tolist())
         self.n_pads = max(calibration.layout.n_pads for calibration in self._groups)
         # For pads that a cube does not have, these values give a stiffness of 0 without a division
