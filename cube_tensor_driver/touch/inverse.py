@@ -259,6 +259,7 @@ class SurfaceInverse:
         self._pressure_gain = self._windows.matrices.gain[:, :, 3].copy()
         self._known = self.observed
         self._predictions: list[CubePrediction] = []
+        self._to_pads: Array | None = None
         self.errors = np.zeros((n, len(self.columns), 0))
         self._error_variance = np.zeros((len(self.points), 2))
 
@@ -313,6 +314,7 @@ class SurfaceInverse:
         """
         self.revision += 1
         self.by_pad[cubes] = by_pad[:, self.columns] * self._unit_factors[:, None]
+        self._to_pads = None
         if self._model is None:
             return
         for cube, own in zip(cubes.tolist(), by_pad, strict=True):
@@ -408,11 +410,13 @@ class SurfaceInverse:
         """
         y = self._fill(residual)
         known = self._known
+        # These matrices take most of the time and rarely change, so they are kept.
+        if self._to_pads is None:
+            self._to_pads = make_stress_matrices(self.by_pad, known)
         # `pad_variance` is the variance of each pad's error, divided by the variance of its noise:
         # 1 for the noise itself, plus the variance that the error of the pad's gain causes. A cube
         # without known values contributes no noise to the field.
-        to_pads = make_stress_matrices(self.by_pad, known)
-        stresses = to_pads @ np.where(known, scaled, 0.0)[:, :, None]
+        stresses = self._to_pads @ np.where(known, scaled, 0.0)[:, :, None]
         pad_variance = 1 + (GAIN_ERROR * stresses[:, :, 0]) ** 2
         pad_variance *= known.any(axis=1, keepdims=True)
 
@@ -439,6 +443,7 @@ class SurfaceInverse:
         # scan.
         if not np.array_equal(known, self._known):
             self._known = known
+            self._to_pads = None
             missing = self.observed & ~known
             incomplete = np.flatnonzero(missing.any(axis=1)).tolist()
             self._predictions = [
