@@ -8,7 +8,7 @@
 #include <math.h>
 #include <string.h>
 
-enum { N = 0, C = 1, P = 2, D = 4, T = 5, M = 9, R, V, O, J }; /* index of each letter in CUBE_SCAN_LETTERS */
+enum { N = 0, C = 1, P = 2, G = 3, D = 4, T = 5, K = 7, M = 9, R, V, O, J }; /* index of each letter in CUBE_SCAN_LETTERS */
 enum { STEP, MIN_DISTANCE, FIRST_LOG, LOG_STEP, STRESSES };    /* numbers in `scale` */
 enum { WIDTH = CUBE_CONTACT_LANES, BLOCK = CUBE_CONTACT_BLOCK, SETS = 8 };
 enum { REAL, IMAGINARY, ORDER };                   /* rows of `gather` */
@@ -229,37 +229,41 @@ INLINE void fill_columns(const cube_contact_call *call, int64_t cube, double hal
     }
 }
 
-/* Returns whether the lengths of the arrays and the orders are possible. */
+/* Returns whether the lengths of the first arrays and the orders are possible. */
 static bool is_possible(const cube_contact_call *call) {
     const int64_t *length = call->length;
     bool is_known = true;
     for (int64_t k = 0; k < length[M]; k++)
         is_known &= call->order[k] >= 0 && call->order[k] < CUBE_CONTACT_ORDERS;
-    for (int64_t k = 0; k < WIDTH; k++)
-        is_known &= call->change_order[k] >= 0 && call->change_order[k] < CUBE_CONTACT_ORDERS;
-    return is_known && length[M] % WIDTH == 0 && length[C] <= WIDTH && length[R] > 3 && length[D] > 4 &&
-           length[T] % 3 == 0;
+    return is_known && length[M] % WIDTH == 0 && length[C] <= WIDTH && length[R] > 3 && length[D] > 4;
 }
 
 CLONES bool cube_respond(const cube_contact_call *call) {
-    const int64_t n = call->length[C];
-    if (!is_possible(call) || call->result == NULL)
+    const int64_t n = call->length[C], n_orders = call->length[M], n_quantities = call->length[G];
+    if (!is_possible(call) || call->result == NULL || call->length[K] != 3 * n_quantities)
         return false;
-    for (int64_t cube = 0; cube < call->length[N]; cube++) {
-        float out[WIDTH] = {0};
+    memset(call->result, 0, (size_t)(call->length[N] * n_quantities * n) * sizeof(double));
+    for (int64_t cube = 0; cube < call->length[N]; cube++)
         for (int64_t j = 0; j < call->length[J]; j++) {
             const offset o = find_offset(call, cube, j, 1, 0);
-            respond(call, &o, call->response, 3, call->order, call->length[M], matrix_of(call, cube), out);
+            for (int64_t g = 0; g < n_quantities; g++) {
+                float out[WIDTH] = {0};
+                const float *table = call->response + g * 3 * n_orders;
+                respond(call, &o, table, 3 * n_quantities, call->order, n_orders, matrix_of(call, cube), out);
+                for (int64_t c = 0; c < n; c++)
+                    call->result[(cube * n_quantities + g) * n + c] += (double)out[c];
+            }
         }
-        for (int64_t c = 0; c < n; c++)
-            call->result[cube * n + c] = (double)out[c];
-    }
     return true;
 }
 
 CLONES bool cube_linearise(const cube_contact_call *call, double halfway) {
     const int64_t n = call->length[C], width = call->length[P], size = n * width;
-    if (!is_possible(call) || width <= SETS * call->length[J] + call->length[T] / 3 || width % BLOCK != 0)
+    bool is_change_possible = call->length[T] % 3 == 0;
+    for (int64_t k = 0; k < WIDTH; k++)
+        is_change_possible &= call->change_order[k] >= 0 && call->change_order[k] < CUBE_CONTACT_ORDERS;
+    if (!is_possible(call) || !is_change_possible || call->length[K] != 3 || width % BLOCK != 0 ||
+        width <= SETS * call->length[J] + call->length[T] / 3)
         return false;
     memset(call->columns, 0, (size_t)(call->length[N] * size) * sizeof(double));
     for (int64_t cube = 0; cube < call->length[N]; cube++) {

@@ -18,27 +18,27 @@
 #define CUBE_CONTACT_BLOCK 4  /* parameters whose derivatives are whitened side by side */
 #define CUBE_CONTACT_ORDERS 9 /* `N_ORDERS` of touch/pad_measurement.py */
 
-/* Arrays of a call: type, name, kind (of numpy), shape, use. The first seven are tables of the skin
- * (`ContactResponse.collect_tables`). `cube_respond` uses the arrays up to `result`, and `cube_linearise`
- * all but `result`.
- * Letters of a shape: R radii, D distances, M circular components (a multiple of 16), O 16 components or
- * outputs, T radial functions, V variants, N cubes, J contacts, C measured components, P parameters and one
- * column for the values (a multiple of 4). */
+/* Arrays of a call: type, name, kind (of numpy), shape, use. `cube_respond` uses the arrays up to
+ * `result`, and `cube_linearise` all but `result`. The tables are from `ContactResponse.collect_tables`.
+ * Letters of a shape: R radii, D distances, K radial functions, M circular components (a multiple of 16), V
+ * variants, N cubes, J contacts, C measured components, G quantities; of the changes by errors of the
+ * elastomer, T radial functions and O 16 components or outputs; and P parameters and one column for the
+ * values (a multiple of 4). */
 #define CUBE_CONTACT_ARRAYS(X)                         \
     X(const double, scale, 'f', "5", INPUT)            \
-    X(const float, response, 'f', "RD3M", INPUT)       \
+    X(const float, response, 'f', "RDKM", INPUT)       \
     X(const int64_t, order, 'i', "M", INPUT)           \
     X(const float, matrix, 'f', "V2MO", INPUT)         \
-    X(const float, change, 'f', "RDTO", INPUT)         \
-    X(const int64_t, change_order, 'i', "O", INPUT)    \
-    X(const float, change_matrix, 'f', "2OO", INPUT)   \
     X(const double, place, 'f', "N2", INPUT)           \
     X(const double, angle, 'f', "N", INPUT)            \
     X(const int64_t, variant, 'i', "N", INPUT)         \
     X(const double, force, 'f', "J3", INPUT)           \
     X(const double, centre, 'f', "J2", INPUT)          \
     X(const double, log_size, 'f', "J", INPUT)         \
-    X(double, result, 'f', "NC", STATE)                \
+    X(double, result, 'f', "NGC", STATE)               \
+    X(const float, change, 'f', "RDTO", INPUT)         \
+    X(const int64_t, change_order, 'i', "O", INPUT)    \
+    X(const float, change_matrix, 'f', "12OO", INPUT)  \
     X(const double, whitening, 'f', "NCC", INPUT)      \
     X(double, columns, 'f', "NCP", RESULT)             \
     X(double, white, 'f', "NCP", RESULT)
@@ -48,15 +48,16 @@ typedef struct {
     int64_t length[sizeof CUBE_SCAN_LETTERS];
 } cube_contact_call;
 
-#define CUBE_RESPOND_N_ARRAYS 14
+#define CUBE_RESPOND_N_ARRAYS 11
 #define CUBE_CONTACT_N_ARRAYS 17
 extern const cube_scan_array cube_contact_arrays[CUBE_CONTACT_N_ARRAYS];
 
 /* Returns a call without arrays. */
 cube_contact_call cube_contact_begin(void);
 
-/* Computes the values of the cubes, summed over the contacts. Returns false if the arrays do not fit
- * together. The numbers in `variant` are not checked. */
+/* Computes the values of the cubes, summed over the contacts, by linear interpolation. Three radial
+ * functions give one quantity. Returns false if the arrays do not fit together. The numbers in `variant`
+ * are not checked. */
 bool cube_respond(const cube_contact_call *call);
 
 /* Computes the derivatives of the values by the parameters, and then the values, in `columns`, and whitens

@@ -93,6 +93,9 @@ class ContactResponse:
     def collect_tables(self, columns: Index) -> tuple[AnyArray, ...]:
         """Return the tables of the skin for the functions in C (native/cube_contact.h).
 
+        These are `scale`, then table, orders and matrices of the response, and then those of its
+        changes by errors of the elastomer.
+
         Args:
             columns: Indices (C,) of the measured components that the functions compute; the same
                 ones in every call.
@@ -115,7 +118,7 @@ class ContactResponse:
                 _pack(matrices, columns),
                 self._sensitivity_rows.reshape(*shape, -1, LANES),
                 _pad(ORDERS),
-                _pack(self._cubes.point_matrix[None], columns)[0],
+                _pack(self._cubes.point_matrix[None], columns),
             )
         return self._packed
 

@@ -102,6 +102,15 @@ def test_values_are_those_of_numpy(inverse, monkeypatch, n_contacts):
 
 
 @pytest.mark.parametrize("n_contacts", [1, 4])
+def test_effects_of_errors_are_those_of_numpy(inverse, monkeypatch, n_contacts):
+    inverse, place, angle, _, discs = draw_load(inverse, n_contacts, 0.05)
+    found = hertz_response.respond_to_errors(inverse, place, angle, discs).swapaxes(1, 2)
+    monkeypatch.setattr(hertz_response, "native", None)
+    expected = hertz_response.respond_to_errors(inverse, place, angle, discs).swapaxes(1, 2)
+    assert (compute_differences(found, expected) < ROUNDING).all()
+
+
+@pytest.mark.parametrize("n_contacts", [1, 4])
 def test_derivatives_are_those_of_numpy(inverse, monkeypatch, n_contacts):
     load = draw_load(inverse, n_contacts)
     n = len(inverse.columns)
@@ -141,16 +150,17 @@ def test_contacts_are_those_of_numpy(monkeypatch):
 
 
 def test_arrays_that_do_not_fit_are_refused(inverse):
-    native, load = hertz_response.native, draw_load(inverse, 2)
-    arrays = hertz_response._collect(*load)
-    result = np.empty((len(load[1]), len(inverse.columns)))
+    inverse, *load = draw_load(inverse, 2)
+    native, tables = hertz_response.native, inverse.contact_response.collect_tables(inverse.columns)
+    arrays = hertz_response._convert(*load)
+    result = np.empty((len(load[0]), 1, len(inverse.columns)))
     with pytest.raises(ValueError, match="array result does not fit"):
-        native.respond(*arrays, result[1:])
-    order = arrays[2].copy()
+        native.respond(*tables[:4], *arrays, result[1:])
+    order = tables[2].copy()
     order[-1] = 9
     with pytest.raises(ValueError, match="do not fit together"):
-        native.respond(*arrays[:2], order, *arrays[3:], result)
-    columns = np.empty((*result.shape, 16))
-    whitening = np.zeros((*result.shape, result.shape[1]))
+        native.respond(*tables[:2], order, tables[3], *arrays, result)
+    columns = np.empty((len(result), result.shape[2], 16))
+    whitening = np.zeros((*columns.shape[:2], result.shape[2]))
     with pytest.raises(ValueError, match="do not fit together"):
-        native.linearise(1.0, *arrays, None, whitening, columns, columns)
+        native.linearise(1.0, *tables[:4], *arrays, None, *tables[4:], whitening, columns, columns)

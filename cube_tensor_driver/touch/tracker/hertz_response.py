@@ -54,20 +54,45 @@ def respond(
     Returns:
         The C components (n, C) in Pa (`ContactResponse.compute_response_to_forces`).
     """
-    values = np.zeros((len(place), len(inverse.columns)))
-    if native is not None:
-        native.respond(*_collect(inverse, place, angle, variant, discs), values)
-        return values
-    for force, centre, log_size in zip(*discs, strict=True):
-        by_disc = inverse.contact_response.compute_response_to_forces(
-            place - centre,
-            angle,
-            variant,
-            np.full(len(place), np.exp(log_size)),
-            np.tile(force, (len(place), 1)),
-        )
-        values += inverse.select(by_disc)
-    return values
+    response = inverse.contact_response
+    if native is None:
+        positions, angles, sizes, forces = _combine(place, angle, discs)
+        variants = np.tile(variant, len(sizes) // len(place))
+        values = response.compute_response_to_forces(positions, angles, variants, sizes, forces)
+        return _sum_over_contacts(inverse.select(values), len(place))
+    tables = response.collect_tables(inverse.columns)
+    result = np.empty((len(place), 1, len(inverse.columns)))
+    native.respond(*tables[:4], *_convert(place, angle, variant, discs), result)
+    return result[:, 0]
+
+
+def respond_to_errors(
+    inverse: SurfaceInverse,
+    place: Array,
+    angle: Array,
+    discs: Discs,
+) -> Array:
+    """Compute how errors of the elastomer change the values of n cubes under J Hertz contacts.
+
+    Args:
+        inverse: Responses (stress in the skin under contacts of unit force).
+        place: Positions (n, 2) of the cubes in m, in the frame of the contacts.
+        angle: Rotations (n,) of the cubes about z in rad, in this frame.
+        discs: The contacts.
+
+    Returns:
+        Changes (n, S, C) in Pa of the C components, for errors of one standard deviation
+        (`ContactResponse.compute_sensitivity`).
+    """
+    response = inverse.contact_response
+    if native is None:
+        changes = response.compute_sensitivity(*_combine(place, angle, discs))
+        return _sum_over_contacts(inverse.select(changes), len(place))
+    scale, _, _, _, *tables = response.collect_tables(inverse.columns)
+    result = np.empty((len(place), response.n_quantities, len(inverse.columns)))
+    no_variant = np.zeros(len(place), np.intp)
+    native.respond(scale, *tables, *_convert(place, angle, no_variant, discs), result)
+    return result
 
 
 def differentiate(
@@ -103,27 +128,52 @@ def differentiate(
     if native is None:
         columns = _differentiate_in_numpy(inverse, place, angle, variant, discs, halfway)
         return columns, whitening @ columns
+    tables = inverse.contact_response.collect_tables(inverse.columns)
+    arrays = _convert(place, angle, variant, discs)
     n_columns = N_PARAMETERS * len(discs.forces) + inverse.contact_response.n_quantities + 1
     n_padded = n_columns + -n_columns % _BLOCK
-    padded = np.empty((*whitening.shape[:2], n_padded))
-    white = np.empty_like(padded)
-    arrays = _collect(inverse, place, angle, variant, discs)
-    native.linearise(halfway, *arrays, None, whitening, padded, white)
-    return padded[..., :n_columns], white[..., :n_columns]
+    columns = np.empty((*whitening.shape[:2], n_padded))
+    white = np.empty_like(columns)
+    native.linearise(halfway, *tables[:4], *arrays, None, *tables[4:], whitening, columns, white)
+    return columns[..., :n_columns], white[..., :n_columns]
 
 
-def _collect(
-    inverse: SurfaceInverse,
+def _convert(
     place: Array,
     angle: Array,
     variant: Index,
     discs: Discs,
 ) -> list[AnyArray]:
-    """Return the arrays that both functions in C take first, with the types that they need."""
-    tables = inverse.contact_response.collect_tables(inverse.columns)
-    doubles = [np.ascontiguousarray(one, float) for one in (place, angle, *discs)]
-    doubles.insert(2, np.ascontiguousarray(variant, np.int64))
-    return [*tables, *doubles]
+    """Return the cubes and contacts as arrays of the types that the functions in C need."""
+    cubes = place, angle, np.asarray(variant, np.int64)
+    return [np.ascontiguousarray(one) for one in (*cubes, *discs)]
+
+
+def _combine(
+    place: Array,
+    angle: Array,
+    discs: Discs,
+) -> tuple[Array, Array, Array, Array]:
+    """Return the pairs of J contacts and n cubes, sorted by contact.
+
+    Returns:
+        Positions (J n, 2) of the cubes from the centres, rotations (J n,) of the cubes, and radii
+        (J n,) and forces (J n, 3) of the contacts.
+    """
+    n_cubes, n_contacts = len(place), len(discs.forces)
+    positions = place - discs.centres[:, None]
+    return (
+        positions.reshape(-1, 2),
+        np.tile(angle, n_contacts),
+        np.exp(discs.log_sizes).repeat(n_cubes),
+        discs.forces.repeat(n_cubes, axis=0),
+    )
+
+
+def _sum_over_contacts(values: Array, n_cubes: int) -> Array:
+    """Return the sums (n, ...) of values (J n, ...) over the contacts."""
+    by_contact = values.reshape(-1, n_cubes, *values.shape[1:])
+    return np.asarray(by_contact.sum(axis=0), float)
 
 
 def _differentiate_in_numpy(
@@ -135,34 +185,21 @@ def _differentiate_in_numpy(
     halfway: float,
 ) -> Array:
     """Compute the derivatives and values (n, C, p + 1) of `differentiate`."""
-    forces, centres, log_sizes = discs
-    n_contacts, n_cubes = len(forces), len(place)
-    n_columns = len(inverse.columns)
-
-    # The responses are computed for all contacts and cubes in one call.
+    n_contacts, n_cubes = len(discs.forces), len(place)
     response = inverse.contact_response
-    positions = (place - centres[:, None]).reshape(-1, 2)
-    angles = np.tile(angle, n_contacts)
+    positions, angles, sizes, forces = _combine(place, angle, discs)
     variants = np.tile(variant, n_contacts)
-    sizes = np.exp(log_sizes).repeat(n_cubes)
-    all_forces = forces.repeat(n_cubes, axis=0)
-    slopes = response.compute_response_slopes(positions, angles, variants, sizes, all_forces)
+    slopes = response.compute_response_slopes(positions, angles, variants, sizes, forces)
     # The derivative by the flatness is the response to a contact minus that to a mixture of a wider
     # and a narrower one (see `FLATNESS_STEP`, h). With the derivatives `first` and `second` by the
     # logarithm of the radius, it is h^2 (first - second / 2), to order h^2.
     first, second = slopes[:, 5], slopes[:, 6]
     slopes[:, 6] = FLATNESS_STEP**2 * (first - second / 2)
-    by_contact = inverse.select(slopes).reshape(n_contacts, n_cubes, N_PARAMETERS, n_columns)
-    of_contacts = by_contact.transpose(1, 3, 0, 2).reshape(n_cubes, n_columns, -1)
-    values = np.einsum("jnpc,jp->nc", by_contact[:, :, :3], forces)
+    by_contact = inverse.select(slopes).reshape(n_contacts, n_cubes, N_PARAMETERS, -1)
+    of_contacts = by_contact.transpose(1, 3, 0, 2).reshape(n_cubes, len(inverse.columns), -1)
+    values = np.einsum("jnpc,jp->nc", by_contact[:, :, :3], discs.forces)
 
-    sensitivity = response.compute_sensitivity(
-        positions / halfway,
-        angles,
-        sizes / halfway,
-        all_forces,
-    )
-    sensitivity[:, :, len(STRESS) :] /= halfway
-    by_elastomer = inverse.select(sensitivity).reshape(n_contacts, n_cubes, -1, n_columns)
-    of_elastomer = by_elastomer.sum(axis=0).swapaxes(1, 2)
+    changes = response.compute_sensitivity(positions / halfway, angles, sizes / halfway, forces)
+    changes[:, :, len(STRESS) :] /= halfway
+    of_elastomer = _sum_over_contacts(inverse.select(changes), n_cubes).swapaxes(1, 2)
     return np.concatenate([of_contacts, of_elastomer, values[:, :, None]], axis=2)

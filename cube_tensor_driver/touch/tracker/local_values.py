@@ -14,6 +14,8 @@ from scipy.linalg.lapack import dtrtri
 from ...core.arrays import Array, Index, Mask
 from ..inverse import SurfaceInverse
 from ..pad_noise import GAIN_ERROR, make_stress_matrices, regularise
+from .contact_estimate import Discs
+from .hertz_response import respond_to_errors
 
 MIN_FACING = 0.5
 """Smallest cosine of the angle between the outward normals of two cubes at which one of them
@@ -309,25 +311,10 @@ class LocalValues:
             Changes (n, C, S) in Pa of the C components of n cubes, if the error of a property is
             one standard deviation.
         """
-        n = len(self.cubes)
-        count = len(centres)
-        response = self._inverse.contact_response
-        offset = self.place[:, None] - centres
-        offset = offset.reshape(-1, 2)
-        angle = np.repeat(self.angle, count)
-        sizes = np.full(n * count, size)
-        all_forces = np.tile(forces.T, (n, 1))
-        changes = response.compute_sensitivity(
-            offset,
-            angle,
-            sizes,
-            all_forces,
-        )
-        changes = changes[:, :, self._inverse.columns]
-        shape = n, count, *changes.shape[1:]
-        by_contact = changes.reshape(shape)
-        total = by_contact.sum(axis=1)
-        return np.asarray(total.swapaxes(1, 2), float)
+        log_sizes = np.full(len(centres), np.log(size))
+        discs = Discs(forces.T, centres, log_sizes)
+        changes = respond_to_errors(self._inverse, self.place, self.angle, discs)
+        return np.asarray(changes.swapaxes(1, 2))
 
 
 def make_rotations_about_normal(angle: Array) -> Array:
