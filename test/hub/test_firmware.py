@@ -30,7 +30,7 @@ from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.rows import concatenate
 from cube_tensor_driver.core.status import STAMP
 from cube_tensor_driver.device.wire.decoder import Decoder
-from cube_tensor_driver.device.wire.protocol import Command, Request, Sample, Time, encode
+from cube_tensor_driver.device.wire.protocol import Command, Request, Sample, Stats, Time, encode
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import list_skin_processes
 from cube_tensor_driver.simulation.cubes import compute_skin_components, make_hub_cubes
@@ -245,6 +245,16 @@ def free_tcp_port() -> int:
         return server.getsockname()[1]
 
 
+def wait_for_power_up(port: str) -> None:
+    """Until the first STATS, of 1 s. QEMU takes a connection before it runs, and then loses the
+    HELLO of power-up."""
+    ear = FrameListener()
+    with PortWire(port, 921_600) as wire:
+        until_s = wire.now() + 30.0
+        while not any(isinstance(one.frame, Stats) for one in ear.hear(wire.listen(1.0), 0.0)):
+            assert wire.now() < until_s
+
+
 def test_hubs_keep_every_rule_on_real_lines(out, tmp_path):
     """Checked at once, because a check mostly waits."""
     with contextlib.ExitStack() as stack:
@@ -259,6 +269,7 @@ def test_hubs_keep_every_rule_on_real_lines(out, tmp_path):
             ports["emulator"], _ = stack.enter_context(
                 emulated_hub(out / "hub.elf", read_skin(SKIN))
             )
+            wait_for_power_up(ports["emulator"])
         by_command = stack.enter_context(cube_hub(out / "cube_hub", "--tcp", str(free_tcp_port())))
         with ThreadPoolExecutor(len(ports) + 1) as pool:
             command = pool.submit(checked_by_command, by_command)
