@@ -177,6 +177,17 @@ _FIRST = 1
 _SHEAR_TERMS = np.repeat([[0, 0, 1, 1], [0, 0, 0, 1]], [1, 1, 3, 3], axis=1)
 """Masks (2, 8) of the terms 1, n, q and |q| q: those of the shear force, and the last one."""
 
+_PARTS = np.repeat(np.array([[1.0, 0, 0], [0, 1, 1], [0, 0, 1]]), [3, 3, 1], axis=0)
+"""Masks (7, 3) of parts of a motion state (`_compute_motion_states`): the position, the shear force
+divided by the normal force, and the latter together with the logarithm of the normal force."""
+
+
+Fits = Mapping[int, HertzFit]
+"""Fits of one Hertz contact each, by the ids of the contacts (`ContactTracker.single_fits`)."""
+
+NO_FITS: Fits = MappingProxyType({})
+"""Fits if none are known."""
+
 
 class Slip(NamedTuple):
     """State and friction of n contacts.
@@ -329,7 +340,7 @@ class SlipEstimator:
         time_s: float,
         values: Array,
         found: Sequence[TrackedContact] | None = None,
-        fits: Mapping[int, HertzFit] = MappingProxyType({}),
+        fits: Fits = NO_FITS,
     ) -> bool:
         """Estimate `slip` from the values of a scan.
 
@@ -339,13 +350,13 @@ class SlipEstimator:
             values: Components (cubes, 15) in Pa and Pa/m, NaN where unknown.
             found: Contacts that the tracker has found in these values. None: it has not looked for
                 them in this scan, and the contacts are the same as in the previous call.
-            fits: `ContactTracker.single_fits`, whose derivatives need not be computed again.
+            fits: Fits in this scan, whose derivatives need not be computed again.
 
         Returns:
             Whether a contact has begun to slip.
         """
         if found is None:
-            fits = {}  # Fits in an earlier scan hold for other positions.
+            fits = NO_FITS  # Fits in an earlier scan hold for other positions.
         else:
             self._match(found)
         contacts = self._contacts
@@ -361,10 +372,17 @@ class SlipEstimator:
         if found is not None:
             contacts.values[:, _NEWEST] = near[:, _NEWEST]
             loads = self._correct(loads)
-        self._linearise_changed(loads, scaled, fits)
+        for row in self._find_changed(loads):
+            self._linearise(row, loads, scaled, fits)
         self._observe_shear(change[:, _FIRST], load_change[:, _FIRST])
         newest = _compute_motion_states(loads, contacts.normal)
-        self._remember(time_s, newest)
+        if time_s < self._times[self._place]:
+            # The time has jumped back, as at the start of another recording.
+            contacts.past[:] = np.nan
+        if time_s != self._times[self._place]:
+            self._place = (self._place + 1) % N_SCANS
+        contacts.past[:, self._place] = newest
+        self._times[self._place] = time_s
 
         places = (self._place - LAGS) % N_SCANS
         motion = newest[:, None] - contacts.past[:, places]
@@ -376,8 +394,9 @@ class SlipEstimator:
         begins = slipped & ~contacts.slips
         contacts.slips = slipped
         is_followed = slipped & ~contacts.is_fitted
-        deviation = np.hypot(contacts.ratio_deviation, FOLLOWED_DEVIATION * ratio)
-        self._add_ratios(is_followed, ratio, deviation)
+        if is_followed.any():
+            deviation = np.hypot(contacts.ratio_deviation, FOLLOWED_DEVIATION * ratio)
+            self._add_ratios(is_followed, ratio, deviation)
         inverse_sum, weight_sum, ratio_sum = contacts.sums.T
         # The friction coefficient is NaN before the first slip of a contact.
         divisor = np.where(weight_sum > 0, weight_sum, np.nan)
@@ -427,7 +446,8 @@ class SlipEstimator:
             followed: The loads in the same scan by the changes of the cubes' values.
         """
         contacts = self._contacts
-        loads = np.array([[*one.force, *one.position] for one in self._found])
+        vectors = [vector for one in self._found for vector in (one.force, one.position)]
+        loads = np.concatenate(vectors).reshape(followed.shape)
         contacts.load = loads.copy()
         # The tracker has fitted the loads again. This corrects the errors of `followed`. The past
         # states get the same correction, so that it does not look like motion.
@@ -439,9 +459,10 @@ class SlipEstimator:
         # contact for the first time while it slips, earlier ratios are dropped, because they were
         # only computed from changes of the values.
         slips = contacts.slips
-        contacts.sums[slips & ~contacts.is_fitted] = 0.0
-        contacts.is_fitted |= slips
-        self._add_ratios(slips, _compute_lengths(after[:, 3:6]), contacts.ratio_deviation)
+        if slips.any():
+            contacts.sums[slips & ~contacts.is_fitted] = 0.0
+            contacts.is_fitted |= slips
+            self._add_ratios(slips, _compute_lengths(after[:, 3:6]), contacts.ratio_deviation)
         return loads
 
     def _add_ratios(self, chosen: Mask, ratio: Array, deviation: Array) -> None:
@@ -455,10 +476,9 @@ class SlipEstimator:
             ratio: Ratios (n,) of shear and normal force.
             deviation: Standard deviations s (n,) of the ratios.
         """
-        if chosen.any():
-            weight = deviation**-2
-            added = np.stack([1 / deviation, weight, ratio * weight], axis=1)
-            self._contacts.sums[chosen] += added[chosen]
+        weight = deviation**-2
+        added = np.stack([1 / deviation, weight, ratio * weight], axis=1)
+        self._contacts.sums[chosen] += added[chosen]
 
     def _observe_shear(self, change: Array, load_change: Array) -> None:
         """Add the values of a scan to the fits of `Slip.partial`.
@@ -529,18 +549,18 @@ class SlipEstimator:
         Returns:
             Whether each contact has moved (n, lags), and whether it has slipped (n, lags).
         """
-        moved = motion[..., :3]
-        distance = _compute_lengths(moved)
+        lengths = np.sqrt(motion**2 @ _PARTS)
+        distance, ratio_change, force_change = lengths.transpose(2, 0, 1)
         moves = distance > MIN_DISTANCE_M
         if not moves.any():
             return moves, moves
 
-        turned = motion[..., 3:6]
+        moved, turned = motion[..., :3], motion[..., 3:6]
         ratio = ratio[:, None]
-        growth = (moved * turned).sum(axis=2) / np.maximum(distance, 1e-12)
+        growth = np.einsum("nlk,nlk->nl", moved, turned) / np.maximum(distance, 1e-12)
         lever = LEVER_M / (1 + 2 * ratio)
         tilt = lever * np.maximum(growth, 0)
-        leak = LEAK_M * _compute_lengths(motion[..., 3:])
+        leak = LEAK_M * force_change
         # A force that changes and returns within a long lag shows no change over it, but may have
         # left the contact shifted. So each lag is allowed the largest shift of all shorter ones.
         explained = np.maximum.accumulate(tilt + leak, axis=1)
@@ -551,38 +571,19 @@ class SlipEstimator:
         # the second half of a lag; if it is small, the contact has stopped.
         moves[:, 1:] &= distance[:, :-1] > MIN_LATE_SHARE * distance[:, 1:]
 
-        along = (moved * shear_ratio[:, None]).sum(axis=2)
+        along = np.einsum("nlk,nk->nl", moved, shear_ratio)
         largest = MIN_SHARE_OF_LARGEST * self._contacts.largest_ratio
         slips = moves & (along > MIN_COSINE * distance * ratio)
         slips &= ratio > np.maximum(MIN_RATIO, largest)[:, None]
-        slips &= _compute_lengths(turned) < MAX_RATIO_CHANGE * ratio
+        slips &= ratio_change < MAX_RATIO_CHANGE * ratio
         return moves, slips
 
-    def _remember(self, time_s: float, newest: Array) -> None:
-        """Store the motion states `newest` (n, 7) of the scan at the time `time_s` (in s)."""
-        past = self._contacts.past
-        last_s = self._times[self._place]
-        if time_s < last_s:
-            # The time has jumped back, as at the start of another recording.
-            past[:] = np.nan
-        if time_s != last_s:
-            self._place = (self._place + 1) % N_SCANS
-        past[:, self._place] = newest
-        self._times[self._place] = time_s
-
-    def _linearise_changed(
-        self,
-        loads: Array,
-        scaled: Array,
-        fits: Mapping[int, HertzFit],
-    ) -> None:
-        """Linearise the response of the cubes again for contacts that are new or have changed.
+    def _find_changed(self, loads: Array) -> list[int]:
+        """Return the numbers of contacts that are to be linearised again.
 
         Args:
             loads: Force in N and position in m (n, 6) of the contacts. The position of a contact
                 that is lost is replaced.
-            scaled: Values (cubes, C) in Pa.
-            fits: As in `update`.
         """
         contacts = self._contacts
         change = loads - contacts.linearised
@@ -594,8 +595,9 @@ class SlipEstimator:
         is_near_fit = since_fit <= MIN_SHIFT_DEPTHS
         max_shift = np.where(is_near_fit, MAX_FITTED_SHIFT_DEPTHS, MAX_SHIFT_DEPTHS)
         has_changed = (force_change > MAX_FORCE_CHANGE) | (shift > max_shift)
-        if not has_changed.any():
-            return
+        changed: list[int] = np.flatnonzero(has_changed)[:MAX_LINEARISATIONS].tolist()
+        if not changed:
+            return changed
 
         # After a sudden change, as of a body that bounces, linear extrapolation with the
         # derivatives gives no useful position. The contact then keeps the position of the last
@@ -604,16 +606,9 @@ class SlipEstimator:
         is_lost = has_jumped & (contacts.noise > 0)
         loads[is_lost, 3:] = contacts.linearised[is_lost, 3:]
         contacts.past[is_lost] = np.nan
-        for row in np.flatnonzero(has_changed)[:MAX_LINEARISATIONS].tolist():
-            self._linearise(row, loads, scaled, fits)
+        return changed
 
-    def _linearise(
-        self,
-        row: int,
-        loads: Array,
-        scaled: Array,
-        fits: Mapping[int, HertzFit],
-    ) -> None:
+    def _linearise(self, row: int, loads: Array, scaled: Array, fits: Fits) -> None:
         """Compute the weights from changes of the cubes' values to changes of one contact's load.
 
         Args:
