@@ -177,10 +177,6 @@ _FIRST = 1
 _SHEAR_TERMS = np.repeat([[0, 0, 1, 1], [0, 0, 0, 1]], [1, 1, 3, 3], axis=1)
 """Masks (2, 8) of the terms 1, n, q and |q| q: those of the shear force, and the last one."""
 
-_PARTS = np.repeat(np.array([[1.0, 0, 0], [0, 1, 1], [0, 0, 1]]), [3, 3, 1], axis=0)
-"""Masks (7, 3) of parts of a motion state (`_compute_motion_states`): the position, the shear force
-divided by the normal force, and the latter together with the logarithm of the normal force."""
-
 
 Fits = Mapping[int, HertzFit]
 """Fits of one Hertz contact each, by the ids of the contacts (`ContactTracker.single_fits`)."""
@@ -229,7 +225,7 @@ NO_CONTACTS = Slip(
 class _Contacts:
     """The n contacts that the tracker has found last. The first axis of each array counts them.
 
-    V values of the cubes near a contact determine its load: force (3) in N and position (3) in m.
+    V values of the cubes near a contact determine its load (2, 3): force in N and position in m.
     The second axis (2) of `cubes`, `weights`, `values` and `pad_variance` stands for two
     linearisations: the newest one (`_NEWEST`), and that with which the fit of `Slip.partial` has
     begun (`_FIRST`). The latter is used for the whole fit, because other weights would give another
@@ -247,8 +243,8 @@ class _Contacts:
         values: Values (n, 2, V) in Pa from which changes are counted.
         pad_variance: Variances (n, 2) of the noise of all V values together in Pa^2.
         noise: Standard deviations (n,) of the position in m; 0 before the first linearisation.
-        load: Loads (n, 6) at the newest `values`.
-        linearised: Loads (n, 6) for which the newest `weights` were computed.
+        load: Loads (n, 2, 3) at the newest `values`.
+        linearised: Loads (n, 2, 3) for which the newest `weights` were computed.
         past: Motion states (n, scans, 7) of the last scans, from `_compute_motion_states`.
         terms: Terms (n, 8) of the fit of `Slip.partial` in the newest scan: 1, n, q and |q| q.
         equations: Normal equations (n, 8, 8 + V) of this fit: sums over its scans of the products
@@ -293,8 +289,8 @@ class _Contacts:
             values=zeros(2, n_values),
             pad_variance=zeros(2),
             noise=zeros(),
-            load=zeros(6),
-            linearised=zeros(6),
+            load=zeros(2, 3),
+            linearised=zeros(2, 3),
             past=zeros(N_SCANS, 7) + np.nan,
             terms=zeros(8),
             equations=zeros(8, 8 + n_values),
@@ -305,6 +301,154 @@ class _Contacts:
         """Return the contacts with these numbers; the number -1 stands for the contact `new`."""
         pairs = zip(vars(self).values(), vars(new).values(), strict=True)
         return _Contacts(*(np.concatenate(pair)[numbers] for pair in pairs))
+
+    def describe(self, found: Sequence[TrackedContact]) -> None:
+        """Take over normals and force ratios of the contacts, and compute `partial`."""
+        for row, one in enumerate(found):
+            ratio = one.shear_force / one.normal_force
+            by_normal_force = ratio * one.force_uncertainty
+            deviation = math.hypot(by_normal_force, one.shear_uncertainty) / one.normal_force
+            self.normal[row] = one.normal
+            self.ratio_deviation[row] = deviation
+            self.largest_ratio[row] = max(self.largest_ratio[row], ratio - 3 * deviation)
+        self.partial = self.estimate_partial_slip()
+
+    def correct(self, found: Sequence[TrackedContact], followed: Array) -> Array:
+        """Take over and return the loads (n, 2, 3) that the tracker has found.
+
+        Args:
+            found: The contacts.
+            followed: Their loads in the same scan by the changes of the cubes' values.
+        """
+        loads = np.array([(one.force, one.position) for one in found])
+        self.load = loads.copy()
+        # The tracker has fitted the loads again. This corrects the errors of `followed`. The past
+        # states get the same correction, so that it does not look like motion.
+        both = np.stack([followed, loads])
+        before, after = _compute_motion_states(both, self.normal)
+        self.past += (after - before)[:, None]
+
+        # The friction coefficient is a mean of force ratios during slip. When the tracker fits a
+        # contact for the first time while it slips, earlier ratios are dropped, because they were
+        # only computed from changes of the values.
+        slips = self.slips
+        if slips.any():
+            self.sums[slips & ~self.is_fitted] = 0.0
+            self.is_fitted |= slips
+            self.add_ratios(slips, _compute_lengths(after[:, 3:6]), self.ratio_deviation)
+        return loads
+
+    def add_ratios(self, chosen: Mask, ratio: Array, deviation: Array) -> None:
+        """Add force ratios of slipping contacts to the weighted mean that is the friction.
+
+        The pads' gains cause the same error in all ratios. So the deviation of the mean is the mean
+        of the deviations s, with the same weights 1 / s^2.
+
+        Args:
+            chosen: Contacts (n,) that slip.
+            ratio: Ratios (n,) of shear and normal force.
+            deviation: Standard deviations s (n,) of the ratios.
+        """
+        weight = deviation**-2
+        added = np.stack([1 / deviation, weight, ratio * weight], axis=1)
+        self.sums[chosen] += added[chosen]
+
+    def observe_shear(self, change: Array, load_change: Array) -> None:
+        """Add the values of a scan to the fits of `Slip.partial`.
+
+        A fit starts again when the normal force or the position has changed, or the contact slips.
+
+        Args:
+            change: Changes (n, V) of the values in Pa since the first scan of each fit.
+            load_change: Changes (n, 2, 3) of the loads that follow from them.
+        """
+        outward, shear = _split_force(load_change[:, 0], self.normal)
+        curved = _compute_lengths(shear)[:, None] * shear
+        one = np.ones_like(outward)
+        terms = np.concatenate([one, outward, shear, curved], axis=1)
+        factors = np.concatenate([terms, change], axis=1)
+        self.terms = terms
+
+        force = _compute_lengths(self.load[:, 0])
+        is_over = np.abs(outward[:, 0]) > MAX_NORMAL_CHANGE * force
+        is_over |= _compute_lengths(load_change[:, 1]) > MAX_SHIFT_M
+        # Before the first linearisation, the weights and so the shear forces of all scans are 0.
+        has_no_shear = self.equations[:, 2, 2] + shear[:, 0] ** 2 == 0
+        is_over |= self.slips | has_no_shear
+        linear = self.cubes, self.weights, self.values, self.pad_variance
+        for row, restarts in enumerate(is_over.tolist()):
+            if restarts:
+                for array in linear:
+                    array[row, _FIRST] = array[row, _NEWEST]
+                self.equations[row] = 0.0
+            else:
+                self.equations[row] += terms[row, :, None] * factors[row]
+
+    def estimate_partial_slip(self) -> Array:
+        """Return `Slip.partial` (n,) by the least-squares fit at the head of this file."""
+        partial = np.full(len(self.terms), np.nan)
+        # Eight coefficients need as many scans. A contact that moves begins again in every scan.
+        rows = np.flatnonzero(self.equations[:, 0, 0] >= 8)
+        if len(rows):
+            gram, moments = np.split(self.equations[rows], [8], axis=2)
+            # The shear force has no component along the normal. A small addition to the diagonal
+            # lets the matrix be inverted nevertheless.
+            size = np.trace(gram, axis1=1, axis2=2)[:, None, None]
+            inverse = np.linalg.inv(gram + 1e-9 * (size + 1) * np.eye(8))
+            terms = self.terms[rows, None] * _SHEAR_TERMS
+            weights = terms @ inverse
+            change, curved = _compute_lengths(weights @ moments).T
+            variance = (weights[:, 1] * terms[:, 1]).sum(axis=1)
+            variance *= self.pad_variance[rows, _FIRST]
+            is_known = variance < (PARTIAL_DEVIATION * change) ** 2
+            partial[rows[is_known]] = curved[is_known] / change[is_known]
+        return partial
+
+    def test_lags(
+        self,
+        motion: Array,
+        duration: Array,
+        shear_ratio: Array,
+        ratio: Array,
+    ) -> tuple[Mask, Mask]:
+        """Test whether each contact has moved, and whether it has slipped, over each of the `LAGS`.
+
+        Args:
+            motion: Changes (n, lags, 7) of the motion states over each lag.
+            duration: Durations (lags,) of the lags in s.
+            shear_ratio: Shear forces (n, 3) in this scan, divided by the normal forces.
+            ratio: Their lengths (n,).
+
+        Returns:
+            Whether each contact has moved (n, lags), and whether it has slipped (n, lags).
+        """
+        moved, turned = motion[..., :3], motion[..., 3:6]
+        distance = _compute_lengths(moved)
+        moves = distance > MIN_DISTANCE_M
+        if not moves.any():
+            return moves, moves
+
+        ratio = ratio[:, None]
+        growth = np.einsum("nlk,nlk->nl", moved, turned) / np.maximum(distance, 1e-12)
+        lever = LEVER_M / (1 + 2 * ratio)
+        tilt = lever * np.maximum(growth, 0)
+        leak = LEAK_M * _compute_lengths(motion[..., 3:])
+        # A force that changes and returns within a long lag shows no change over it, but may have
+        # left the contact shifted. So each lag is allowed the largest shift of all shorter ones.
+        explained = np.maximum.accumulate(tilt + leak, axis=1)
+        noise = SIGNIFICANCE * np.sqrt(2) * self.noise[:, None]
+        moves = distance > np.maximum(noise, MIN_DISTANCE_M) + explained
+        moves &= distance > MIN_SPEED * duration
+        # A lag is twice the one before. The motion over the lag before is therefore the motion in
+        # the second half of a lag; if it is small, the contact has stopped.
+        moves[:, 1:] &= distance[:, :-1] > MIN_LATE_SHARE * distance[:, 1:]
+
+        along = np.einsum("nlk,nk->nl", moved, shear_ratio)
+        largest = MIN_SHARE_OF_LARGEST * self.largest_ratio
+        slips = moves & (along > MIN_COSINE * distance * ratio)
+        slips &= ratio > np.maximum(MIN_RATIO, largest)[:, None]
+        slips &= _compute_lengths(turned) < MAX_RATIO_CHANGE * ratio
+        return moves, slips
 
 
 class SlipEstimator:
@@ -367,14 +511,14 @@ class SlipEstimator:
         near = scaled[contacts.cubes].reshape(contacts.values.shape)
         change = near - contacts.values
         change[np.isnan(change)] = 0.0  # A value that is missing counts as unchanged.
-        load_change = (contacts.weights @ change[..., None])[..., 0]
+        load_change = (contacts.weights @ change[..., None]).reshape(-1, 2, 2, 3)
         loads = contacts.load + load_change[:, _NEWEST]
         if found is not None:
             contacts.values[:, _NEWEST] = near[:, _NEWEST]
-            loads = self._correct(loads)
+            loads = contacts.correct(found, loads)
         for row in self._find_changed(loads):
             self._linearise(row, loads, scaled, fits)
-        self._observe_shear(change[:, _FIRST], load_change[:, _FIRST])
+        contacts.observe_shear(change[:, _FIRST], load_change[:, _FIRST])
         newest = _compute_motion_states(loads, contacts.normal)
         if time_s < self._times[self._place]:
             # The time has jumped back, as at the start of another recording.
@@ -389,14 +533,14 @@ class SlipEstimator:
         duration = time_s - self._times[places]
         shear_ratio = newest[:, 3:6]
         ratio = _compute_lengths(shear_ratio)
-        moves, slips = self._test_lags(motion, duration, shear_ratio, ratio)
+        moves, slips = contacts.test_lags(motion, duration, shear_ratio, ratio)
         slipped: Mask = np.any(slips, axis=1)
         begins = slipped & ~contacts.slips
         contacts.slips = slipped
         is_followed = slipped & ~contacts.is_fitted
         if is_followed.any():
             deviation = np.hypot(contacts.ratio_deviation, FOLLOWED_DEVIATION * ratio)
-            self._add_ratios(is_followed, ratio, deviation)
+            contacts.add_ratios(is_followed, ratio, deviation)
         inverse_sum, weight_sum, ratio_sum = contacts.sums.T
         # The friction coefficient is NaN before the first slip of a contact.
         divisor = np.where(weight_sum > 0, weight_sum, np.nan)
@@ -408,7 +552,7 @@ class SlipEstimator:
         state = np.where(sticks, STICK, UNKNOWN)
         state[slipped] = SLIP
         velocity = np.zeros((len(state), 3))
-        velocity[state == UNKNOWN] = np.nan
+        velocity[~sticks] = np.nan
         for row in np.flatnonzero(slipped).tolist():
             shortest = slips[row].argmax()
             velocity[row] = motion[row, shortest, :3] / duration[shortest]
@@ -426,175 +570,26 @@ class SlipEstimator:
         """Take over the contacts that the tracker has found, except for their loads."""
         known = {one.id: number for number, one in enumerate(self._found)}
         numbers = [known.get(one.id, -1) for one in found]
-        self._found = found
         if numbers != list(range(len(known))):
             self._contacts = self._contacts.select(numbers, self._new)
-        contacts = self._contacts
-        for row, one in enumerate(found):
-            ratio = one.shear_force / one.normal_force
-            by_normal_force = ratio * one.force_uncertainty
-            deviation = math.hypot(by_normal_force, one.shear_uncertainty) / one.normal_force
-            contacts.normal[row] = one.normal
-            contacts.ratio_deviation[row] = deviation
-            contacts.largest_ratio[row] = max(contacts.largest_ratio[row], ratio - 3 * deviation)
-        contacts.partial = self._estimate_partial_slip()
-
-    def _correct(self, followed: Array) -> Array:
-        """Take over and return the loads (n, 6) that the tracker has found.
-
-        Args:
-            followed: The loads in the same scan by the changes of the cubes' values.
-        """
-        contacts = self._contacts
-        vectors = [vector for one in self._found for vector in (one.force, one.position)]
-        loads = np.concatenate(vectors).reshape(followed.shape)
-        contacts.load = loads.copy()
-        # The tracker has fitted the loads again. This corrects the errors of `followed`. The past
-        # states get the same correction, so that it does not look like motion.
-        both = np.stack([followed, loads])
-        before, after = _compute_motion_states(both, contacts.normal)
-        contacts.past += (after - before)[:, None]
-
-        # The friction coefficient is a mean of force ratios during slip. When the tracker fits a
-        # contact for the first time while it slips, earlier ratios are dropped, because they were
-        # only computed from changes of the values.
-        slips = contacts.slips
-        if slips.any():
-            contacts.sums[slips & ~contacts.is_fitted] = 0.0
-            contacts.is_fitted |= slips
-            self._add_ratios(slips, _compute_lengths(after[:, 3:6]), contacts.ratio_deviation)
-        return loads
-
-    def _add_ratios(self, chosen: Mask, ratio: Array, deviation: Array) -> None:
-        """Add force ratios of slipping contacts to the weighted mean that is the friction.
-
-        The pads' gains cause the same error in all ratios. So the deviation of the mean is the mean
-        of the deviations s, with the same weights 1 / s^2.
-
-        Args:
-            chosen: Contacts (n,) that slip.
-            ratio: Ratios (n,) of shear and normal force.
-            deviation: Standard deviations s (n,) of the ratios.
-        """
-        weight = deviation**-2
-        added = np.stack([1 / deviation, weight, ratio * weight], axis=1)
-        self._contacts.sums[chosen] += added[chosen]
-
-    def _observe_shear(self, change: Array, load_change: Array) -> None:
-        """Add the values of a scan to the fits of `Slip.partial`.
-
-        A fit starts again when the normal force or the position has changed, or the contact slips.
-
-        Args:
-            change: Changes (n, V) of the values in Pa since the first scan of each fit.
-            load_change: Changes (n, 6) of the loads that follow from them.
-        """
-        contacts = self._contacts
-        outward, shear = _split_force(load_change[:, :3], contacts.normal)
-        curved = _compute_lengths(shear)[:, None] * shear
-        one = np.ones_like(outward)
-        terms = np.concatenate([one, outward, shear, curved], axis=1)
-        factors = np.concatenate([terms, change], axis=1)
-        contacts.terms = terms
-
-        force = _compute_lengths(contacts.load[:, :3])
-        is_over = np.abs(outward[:, 0]) > MAX_NORMAL_CHANGE * force
-        is_over |= _compute_lengths(load_change[:, 3:]) > MAX_SHIFT_M
-        is_over |= contacts.slips | (contacts.equations[:, 2, 2] + shear[:, 0] ** 2 == 0)
-        linear = contacts.cubes, contacts.weights, contacts.values, contacts.pad_variance
-        for row, restarts in enumerate(is_over.tolist()):
-            if restarts:
-                for array in linear:
-                    array[row, _FIRST] = array[row, _NEWEST]
-                contacts.equations[row] = 0.0
-            else:
-                contacts.equations[row] += terms[row, :, None] * factors[row]
-
-    def _estimate_partial_slip(self) -> Array:
-        """Return `Slip.partial` (n,) by the least-squares fit at the head of this file."""
-        contacts = self._contacts
-        partial = np.full(len(self._found), np.nan)
-        # Eight coefficients need as many scans. A contact that moves begins again in every scan.
-        rows = np.flatnonzero(contacts.equations[:, 0, 0] >= 8)
-        if len(rows):
-            gram, moments = np.split(contacts.equations[rows], [8], axis=2)
-            # The shear force has no component along the normal. A small addition to the diagonal
-            # lets the matrix be inverted nevertheless.
-            size = np.trace(gram, axis1=1, axis2=2)[:, None, None]
-            inverse = np.linalg.inv(gram + 1e-9 * (size + 1) * np.eye(8))
-            terms = contacts.terms[rows, None] * _SHEAR_TERMS
-            weights = terms @ inverse
-            change, curved = _compute_lengths(weights @ moments).T
-            variance = (weights[:, 1] * terms[:, 1]).sum(axis=1)
-            variance *= contacts.pad_variance[rows, _FIRST]
-            is_known = variance < (PARTIAL_DEVIATION * change) ** 2
-            partial[rows[is_known]] = curved[is_known] / change[is_known]
-        return partial
-
-    def _test_lags(
-        self,
-        motion: Array,
-        duration: Array,
-        shear_ratio: Array,
-        ratio: Array,
-    ) -> tuple[Mask, Mask]:
-        """Test whether each contact has moved, and whether it has slipped, over each of the `LAGS`.
-
-        Args:
-            motion: Changes (n, lags, 7) of the motion states over each lag.
-            duration: Durations (lags,) of the lags in s.
-            shear_ratio: Shear forces (n, 3) in this scan, divided by the normal forces.
-            ratio: Their lengths (n,).
-
-        Returns:
-            Whether each contact has moved (n, lags), and whether it has slipped (n, lags).
-        """
-        lengths = np.sqrt(motion**2 @ _PARTS)
-        distance, ratio_change, force_change = lengths.transpose(2, 0, 1)
-        moves = distance > MIN_DISTANCE_M
-        if not moves.any():
-            return moves, moves
-
-        moved, turned = motion[..., :3], motion[..., 3:6]
-        ratio = ratio[:, None]
-        growth = np.einsum("nlk,nlk->nl", moved, turned) / np.maximum(distance, 1e-12)
-        lever = LEVER_M / (1 + 2 * ratio)
-        tilt = lever * np.maximum(growth, 0)
-        leak = LEAK_M * force_change
-        # A force that changes and returns within a long lag shows no change over it, but may have
-        # left the contact shifted. So each lag is allowed the largest shift of all shorter ones.
-        explained = np.maximum.accumulate(tilt + leak, axis=1)
-        noise = SIGNIFICANCE * np.sqrt(2) * self._contacts.noise[:, None]
-        moves = distance > np.maximum(noise, MIN_DISTANCE_M) + explained
-        moves &= distance > MIN_SPEED * duration
-        # A lag is twice the one before. The motion over the lag before is therefore the motion in
-        # the second half of a lag; if it is small, the contact has stopped.
-        moves[:, 1:] &= distance[:, :-1] > MIN_LATE_SHARE * distance[:, 1:]
-
-        along = np.einsum("nlk,nk->nl", moved, shear_ratio)
-        largest = MIN_SHARE_OF_LARGEST * self._contacts.largest_ratio
-        slips = moves & (along > MIN_COSINE * distance * ratio)
-        slips &= ratio > np.maximum(MIN_RATIO, largest)[:, None]
-        slips &= ratio_change < MAX_RATIO_CHANGE * ratio
-        return moves, slips
+        self._contacts.describe(found)
+        self._found = found
 
     def _find_changed(self, loads: Array) -> list[int]:
         """Return the numbers of contacts that are to be linearised again.
 
         Args:
-            loads: Force in N and position in m (n, 6) of the contacts. The position of a contact
+            loads: Force in N and position in m (n, 2, 3) of the contacts. The position of a contact
                 that is lost is replaced.
         """
         contacts = self._contacts
-        change = loads - contacts.linearised
         depth = self._inverse.depth
-        force = np.maximum(_compute_lengths(loads[:, :3]), MIN_FORCE_N)
-        force_change = _compute_lengths(change[:, :3]) / force
-        shift = _compute_lengths(change[:, 3:]) / depth
-        since_fit = _compute_lengths(loads[:, 3:] - contacts.load[:, 3:]) / depth
-        is_near_fit = since_fit <= MIN_SHIFT_DEPTHS
+        force = np.maximum(_compute_lengths(loads[:, 0]), MIN_FORCE_N)
+        force_change, shift = _compute_lengths(loads - contacts.linearised).T
+        since_fit = _compute_lengths(loads[:, 1] - contacts.load[:, 1])
+        is_near_fit = since_fit <= MIN_SHIFT_DEPTHS * depth
         max_shift = np.where(is_near_fit, MAX_FITTED_SHIFT_DEPTHS, MAX_SHIFT_DEPTHS)
-        has_changed = (force_change > MAX_FORCE_CHANGE) | (shift > max_shift)
+        has_changed = (force_change > MAX_FORCE_CHANGE * force) | (shift > max_shift * depth)
         changed: list[int] = np.flatnonzero(has_changed)[:MAX_LINEARISATIONS].tolist()
         if not changed:
             return changed
@@ -602,9 +597,9 @@ class SlipEstimator:
         # After a sudden change, as of a body that bounces, linear extrapolation with the
         # derivatives gives no useful position. The contact then keeps the position of the last
         # linearisation, and its past counts as unknown.
-        has_jumped = (force_change > MAX_JUMP) | (shift > 1)
+        has_jumped = (force_change > MAX_JUMP * force) | (shift > depth)
         is_lost = has_jumped & (contacts.noise > 0)
-        loads[is_lost, 3:] = contacts.linearised[is_lost, 3:]
+        loads[is_lost, 1] = contacts.linearised[is_lost, 1]
         contacts.past[is_lost] = np.nan
         return changed
 
@@ -613,14 +608,14 @@ class SlipEstimator:
 
         Args:
             row: Number of the contact.
-            loads: Force in N and position in m (n, 6) of all contacts.
+            loads: Force in N and position in m (n, 2, 3) of all contacts.
             scaled: Values (cubes, C) in Pa.
             fits: As in `update`.
         """
         inverse = self._inverse
         poses = inverse.poses
         contacts = self._contacts
-        positions = loads[:, 3:]
+        positions = loads[:, 1]
         place = positions[row]
         distance = _compute_lengths(self._above_cubes - place)
         is_turned_away = self._normals @ contacts.normal[row] < MIN_FACING
@@ -640,7 +635,7 @@ class SlipEstimator:
             usable = np.where(is_turned_away[:, None], np.nan, scaled)
             self._noise.update(usable, cubes)
             local = LocalValues(inverse, self._noise, home, cubes)
-            forces = loads[near, :3] @ rotation
+            forces = loads[near, 0] @ rotation
             centres = (positions[near] - poses.position[home]) @ rotation
             areas = [self._found[number].area for number in near.tolist()]
             discs = Discs(forces, centres[:, :2], np.log(np.divide(areas, np.pi)) / 2)
@@ -680,9 +675,9 @@ def _compute_motion_states(loads: Array, normal: Array) -> Array:
     logarithm of the normal force in N.
 
     Args:
-        loads: Force in N and position in m (..., n, 6) of the contacts.
+        loads: Force in N and position in m (..., n, 2, 3) of the contacts.
         normal: Normals (n, 3) out of the skin.
     """
-    outward, shear = _split_force(loads[..., :3], normal)
+    outward, shear = _split_force(loads[..., 0, :], normal)
     pressing = np.maximum(-outward, 1e-3 * MIN_FORCE_N)
-    return np.concatenate([loads[..., 3:], shear / pressing, np.log(pressing)], axis=-1)
+    return np.concatenate([loads[..., 1, :], shear / pressing, np.log(pressing)], axis=-1)
