@@ -87,10 +87,11 @@ def test_stated_deviations_are_those_of_the_errors(cubes):
 @pytest.mark.parametrize("wrong", [{"poisson": 0.46}, {"depth_error": 0.15e-3}])
 def test_wrong_data_of_the_elastomer_are_found_or_stated(wrong, shape):
     """Taken for right, they cost 3 % of the force, eleven stated deviations, or five of the place.
-    A ball is a Hertz contact, a wide punch is not. Six loads leave 0.6 to 1.5 open."""
+    A ball is a Hertz contact, a wide punch is not. Six loads leave 0.6 to 1.5 open. The depth makes
+    up three quarters of the place's deviation: without an error of it, the ratio is a quarter."""
     errors = TractionBench(Setting(shape=shape, **wrong), side=2).compute_errors(15e-3, cases=6)
     force, place = errors.ratio[1]
-    assert 0.4 < force < 2 and 0.4 < place < 2
+    assert 0.4 < force < 2 and 0.2 < place < 2
     assert errors.force[1] < 0.003 and errors.position[1] < 0.1e-3
 
 
@@ -446,6 +447,17 @@ def test_fingertips_edges_and_rods_have_their_force_and_place(shape, cubes, pitc
         assert np.linalg.norm(place - centre) < 0.2e-3
         assert np.linalg.norm(sum(one.force[:2] for one in found) - [0.6, -0.6]) < 0.03
         assert abs(force - 3) < 4 * np.linalg.norm([one.force_uncertainty for one in found])
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_rod_above_a_row_of_planar_cubes_is_fitted_on_a_finer_grid(seed):
+    """The grid of the whole region misses 2.5 % of its force, four stated deviations."""
+    bench = TractionBench(Setting(cubes=CUBES[1], pitch=12e-3, depth=4e-3), side=2)
+    turned = make_bar(40e-3, 3e-3) @ rotation_from_rpy(0, 0, 3.076).T
+    random, force = np.random.default_rng(seed), np.array([0.3, 0.8, -3.0])
+    values = compute_values_under(bench, turned, np.array([3e-3, -0.5e-3]), force, random)
+    (found,) = ContactTracker(bench.inverse, LEAST).update(values, max_work=np.inf)
+    assert abs(found.normal_force - 3) < min(0.03, 4 * found.force_uncertainty)
 
 
 @pytest.mark.parametrize("outside", [0.5, 1.0])

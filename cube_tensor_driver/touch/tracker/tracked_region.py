@@ -163,9 +163,9 @@ class Work(IntEnum):
 
     MOVE makes a Gauss-Newton step of Hertz contacts. BEGIN makes the first fit of a Hertz contact.
     PREPARE places grid contacts (small contacts on a grid); SOLVE fits the traction by them. CHOOSE
-    tries one Hertz contact for each contact instead. RENEW solves again for the same grid contacts.
-    SHARPEN repeats the fit with a narrower prior, or with the newest stress of other regions if
-    that has changed. NONE stands for a fit that needs no step.
+    tries one Hertz contact for each contact instead. RENEW solves again on the same region.
+    SHARPEN repeats the fit with a narrower prior or a finer grid, or with the newest stress of
+    other regions if that has changed. NONE stands for a fit that needs no step.
     """
 
     MOVE = 0
@@ -185,7 +185,7 @@ WORK_MS = {
     Work.CHOOSE: 2.5,
     Work.PREPARE: 5.0,
     Work.RENEW: 7.5,
-    Work.SHARPEN: 7.0,
+    Work.SHARPEN: 8.0,
 }
 """Approximate CPU time, in ms, of the steps of a region with `MAX_GRID_CONTACTS` grid contacts. The
 work in a scan is counted with these numbers, not with a clock, so that a recording gives the same
@@ -551,7 +551,8 @@ class TrackedRegion:
         elif isinstance(fit, GridFit) and self._have_others_changed(fit):
             self._solve_grid()
         elif isinstance(fit, GridFit):
-            fit.sharpen(self._whiten(fit.values))
+            fit = fit.sharpen(self._whiten(fit.values))
+            self.fit = fit
             self._is_hertz_due = fit.is_sharp
             self._first_misfit = fit.misfit
 
@@ -656,7 +657,7 @@ class TrackedRegion:
                 self._noise.update(self._noise.scaled, cubes)
                 values = self._collect(self.home, cubes)
                 if values.count:
-                    self._prepared = GridFit(inverse, self.points, values)
+                    self._prepared = GridFit.cover(inverse, self.points, values)
                 return
 
     def _solve_grid(self) -> None:
@@ -665,6 +666,7 @@ class TrackedRegion:
         fit = self._prepared or self.fit
         self._prepared = None
         if isinstance(fit, GridFit) and fit.values.has_same_values:
+            fit = fit.of_region
             fit.solve(self._whiten_newest(fit.values))
             self._is_hertz_due = not self._is_direct
             self._accept(fit)
