@@ -169,23 +169,13 @@ def make_contact_finder(
     elastomer = elastomer or Elastomer(SURFACE_DEPTH, np.inf)
     if method == INTERPOLATION:
         return _InterpolationFinder(settings, poses, elastomer)
-    return _InverseFinder(
-        settings,
-        poses,
-        calibrations,
-        elastomer,
-    )
+    return _InverseFinder(settings, poses, calibrations, elastomer)
 
 
 class _InterpolationFinder:
     """Finds contacts in the pressure that is interpolated between the cubes (surface.py)."""
 
-    def __init__(
-        self,
-        settings: ContactSettings,
-        poses: CubePoses,
-        elastomer: Elastomer,
-    ) -> None:
+    def __init__(self, settings: ContactSettings, poses: CubePoses, elastomer: Elastomer) -> None:
         self._surface = Surface(poses, elastomer.depth)
         self._threshold = settings.least
         self.contacts: list[Contact] = []
@@ -234,13 +224,7 @@ class _InverseFinder:
         self._pipeline = Pipeline(calibrations)
         self._left_out = np.zeros(len(calibrations), np.uint32)
         self._errors: Array | None = None
-        self._inverse = SurfaceInverse.from_poses(
-            poses,
-            by_pad,
-            layer,
-            depth,
-            model=model,
-        )
+        self._inverse = SurfaceInverse.from_poses(poses, by_pad, layer, depth, model=model)
         self._tracker = ContactTracker(self._inverse, settings.least)
         self._slip = SlipEstimator(self._inverse)
         self._links = TouchLinks(poses)
@@ -264,11 +248,7 @@ class _InverseFinder:
         # computed again for cubes whose pads in use have changed since the last scan.
         changed = np.flatnonzero(left_out != self._left_out)
         if len(changed):
-            by_pad = compute_noise_by_pad(
-                self._pipeline,
-                changed,
-                left_out[changed],
-            )
+            by_pad = compute_noise_by_pad(self._pipeline, changed, left_out[changed])
             self._inverse.leave_out(changed, by_pad)
             self._left_out = left_out.copy()
         if errors is not self._errors:
@@ -291,11 +271,4 @@ class _InverseFinder:
         along_x, along_y, _ = field.traction.T
         shear = np.hypot(along_x, along_y)
         deviation = self._tracker.deviation(values).pressure
-        return np.column_stack(
-            [
-                self._inverse.points,
-                field.pressure,
-                shear,
-                deviation,
-            ]
-        )
+        return np.column_stack([self._inverse.points, field.pressure, shear, deviation])

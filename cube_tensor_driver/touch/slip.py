@@ -473,7 +473,7 @@ class SlipEstimator:
         n_cubes = min(N_CUBES, len(self._above_cubes))
         self._new = _Contacts.make_new(n_cubes, n_cubes * len(inverse.columns))
         self._contacts = self._new.select([], self._new)
-        self._found: Sequence[TrackedContact] = ()
+        self._found: list[TrackedContact] = []
         # `past` and `_times` are ring buffers, in which the newest scan has the index `_place`.
         self._times = np.full(N_SCANS, -np.inf)
         self._place = 0
@@ -573,7 +573,7 @@ class SlipEstimator:
         if numbers != list(range(len(known))):
             self._contacts = self._contacts.select(numbers, self._new)
         self._contacts.describe(found)
-        self._found = found
+        self._found = list(found)
 
     def _find_changed(self, loads: Array) -> list[int]:
         """Return the numbers of contacts that are to be linearised again.
