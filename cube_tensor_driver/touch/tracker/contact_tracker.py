@@ -35,11 +35,8 @@ from .local_values import CubeNoise, make_rotations_about_normal, unroll_points
 from .pressure_regions import PressureRegions
 from .tracked_region import (
     COARSE_DEVIATION,
-    HOPELESS,
-    MAX_STEPS,
     TrackedRegion,
     Work,
-    iterate,
     update_responses,
 )
 
@@ -51,7 +48,7 @@ when the regions beside it are fitted, too."""
 MAX_REGIONS = 32
 """Largest number of regions of contact on one skin; those with the largest pressure are kept."""
 
-MAX_WORK_PER_SCAN = 17.0
+MAX_WORK_PER_SCAN = 12.0
 """Largest computing time of the steps of fits in one scan (set of values of all cubes), in ms, as
 estimated by `WORK_MS`. The remaining steps are made in the next scans; one step is always made."""
 
@@ -360,43 +357,8 @@ class ContactTracker:
             if left < 0 and not is_first:
                 break
             is_first = False
-            improved = [number]
-            if work == Work.BEGIN:
-                # Fits that begin together need the responses to other regions only once.
-                one_ms = region.estimate_ms(work)
-                begun = [k for k, (other, _) in enumerate(order) if other == Work.BEGIN]
-                begun.sort(key=order.__getitem__)
-                improved = [k for n, k in enumerate(begun) if n * one_ms <= max(left, 0.0)]
-                left -= (len(improved) - 1) * one_ms
-                self._begin_fits([self._regions[k] for k in improved])
-            else:
-                region.improve(work)
-            for k in improved:
-                order[k] = self._regions[k].next_work, -self._regions[k].waited
-
-    def _begin_fits(self, regions: list[TrackedRegion]) -> None:
-        """Make the first fit of a Hertz contact in each of some regions."""
-        inverse = self._inverse
-        homes = [region.home for region in regions]
-        cubes = np.unique(inverse.near[homes])
-        self._noise.update(self._scaled, cubes)
-        if len(self._regions) > 1:
-            update_responses(inverse, self._regions, cubes)
-        responses = self._sum_responses(cubes)
-        started = [
-            region.start_hertz(home, *responses)
-            for region, home in zip(regions, homes, strict=True)
-        ]
-        iterate(inverse, started, MAX_STEPS // 2)
-        unfinished = [
-            one
-            for region, one in zip(regions, started, strict=True)
-            if one[0].needs_linearisation
-            and one[0].shape_misfit < HOPELESS * region.max_first_misfit
-        ]
-        iterate(inverse, unfinished, MAX_STEPS // 2)
-        for region, (fit, _) in zip(regions, started, strict=True):
-            region.accept_hertz(fit)
+            region.improve(work)
+            order[number] = region.next_work, -region.waited
 
     def _integrate_field(self, field: TractionField) -> None:
         """Estimate the contacts of regions without a fit by integrals of the traction field.

@@ -179,13 +179,13 @@ class Work(IntEnum):
 
 
 WORK_MS = {
-    Work.MOVE: 0.5,
-    Work.BEGIN: 2.0,
-    Work.SOLVE: 7.5,
-    Work.CHOOSE: 2.5,
-    Work.PREPARE: 5.0,
-    Work.RENEW: 7.5,
-    Work.SHARPEN: 8.0,
+    Work.MOVE: 0.2,
+    Work.BEGIN: 1.6,
+    Work.SOLVE: 8.5,
+    Work.CHOOSE: 0.7,
+    Work.PREPARE: 6.5,
+    Work.RENEW: 8.5,
+    Work.SHARPEN: 8.5,
 }
 """Approximate CPU time, in ms, of the steps of a region with `MAX_GRID_CONTACTS` grid contacts. The
 work in a scan is counted with these numbers, not with a clock, so that a recording gives the same
@@ -531,11 +531,13 @@ class TrackedRegion:
         """Make the next step of the fit, for the newest values.
 
         Args:
-            work: Kind of the step (`next_work`), but not BEGIN (`start_hertz`).
+            work: Kind of the step (`next_work`).
         """
         self.waited = 0
         fit = self.fit
-        if work == Work.PREPARE:
+        if work == Work.BEGIN:
+            self._begin_hertz()
+        elif work == Work.PREPARE:
             self._prepare_grid()
         elif work in (Work.SOLVE, Work.RENEW):
             self._solve_grid()
@@ -543,7 +545,7 @@ class TrackedRegion:
             self._steps += 1
             before = fit.found
             fit.values.refresh_if_stale()
-            iterate(self._inverse, [(fit, self._whiten(fit.values))], 1)
+            iterate(self._inverse, fit, self._whiten(fit.values), 1)
             if not fit.is_pressing:
                 fit.found = before
         elif isinstance(fit, GridFit) and work == Work.CHOOSE:
@@ -580,41 +582,24 @@ class TrackedRegion:
         """
         return values.whiten(self._noise.scaled, self.others)
 
-    def start_hertz(
-        self,
-        home: int,
-        total: Array,
-        deviation: Array,
-    ) -> tuple[HertzFit, Array]:
-        """Return a fit of one Hertz contact that starts at the contact that the linear inverse
-        problem found, and the whitened values for its steps.
+    def _begin_hertz(self) -> None:
+        """Fit one Hertz contact, from the contact that the linear inverse problem found.
 
-        Args:
-            home: `home` of this region.
-            total: Response (cubes, C), in Pa, of all cubes to all regions, this one included.
-            deviation: Standard deviation (cubes, C) of this response, in Pa.
-        """
-        self._is_hertz_due = False
-        self.waited = 0
-        values = self._collect(home, self._inverse.near[home])
-        self.subtract_others(values, total, deviation)
-        values.refresh()
-        return HertzFit(self._inverse, values, self._start), self._whiten(values)
-
-    @property
-    def max_first_misfit(self) -> float:
-        """Largest misfit with which the first Hertz contact of this region is kept."""
-        return MAX_NEAR_MISFIT if self.near else MAX_HERTZ_MISFIT
-
-    def accept_hertz(self, fit: HertzFit) -> None:
-        """Keep the fit of the first Hertz contact if it presses, its steps converged and its misfit
-        is small.
-
-        If other regions are near, their contacts may cause the misfit, which then falls when these
+        The fit is kept if the contact presses, the steps have converged and the misfit is small. If
+        other regions are near, their contacts may cause the misfit, which then falls when these
         regions are fitted, too. So the fit is then kept up to a misfit of `MAX_NEAR_MISFIT`, even
         if its steps have not converged.
         """
-        is_plausible = fit.is_pressing and fit.shape_misfit < self.max_first_misfit
+        self._is_hertz_due = False
+        home = self.home
+        values = self._collect(home, self._inverse.near[home])
+        white = self._whiten_newest(values)
+        fit = HertzFit(self._inverse, values, self._start)
+        iterate(self._inverse, fit, white, MAX_STEPS // 2)
+        max_misfit = MAX_NEAR_MISFIT if self.near else MAX_HERTZ_MISFIT
+        if fit.needs_linearisation and fit.shape_misfit < HOPELESS * max_misfit:
+            iterate(self._inverse, fit, white, MAX_STEPS // 2)
+        is_plausible = fit.is_pressing and fit.shape_misfit < max_misfit
         is_settled = not fit.is_unsettled or self.near
         if fit.values.count and is_plausible and is_settled:
             self._accept(fit)
@@ -684,7 +669,7 @@ class TrackedRegion:
         log_sizes = np.minimum(discs.log_sizes, np.log(largest_size))
         discs = discs._replace(log_sizes=log_sizes)
         fit = HertzFit(self._inverse, grid_fit.values, discs)
-        iterate(self._inverse, [(fit, self._whiten(fit.values))], MAX_STEPS)
+        iterate(self._inverse, fit, self._whiten(fit.values), MAX_STEPS)
         # The evidence of all cubes can hide a misfit of the nearest cubes. So their misfit is
         # tested, too, except if there are other regions, whose contacts may cause it.
         is_round = fit.shape_misfit < MAX_HERTZ_MISFIT or np.isfinite(self.gap)
@@ -708,23 +693,20 @@ class TrackedRegion:
         self._first_misfit = max(fit.shape_misfit, lowest_misfit)
 
 
-def iterate(
-    inverse: SurfaceInverse,
-    fits: Sequence[tuple[HertzFit, Array]],
-    steps: int,
-) -> None:
-    """Make Gauss-Newton steps until each fit has converged, but at most a number of them.
+def iterate(inverse: SurfaceInverse, fit: HertzFit, white: Array, steps: int) -> None:
+    """Make Gauss-Newton steps until the fit has converged, but at most a number of them.
 
     Args:
         inverse: Responses of the skin.
-        fits: The fits, each with its whitened values.
+        fit: The fit.
+        white: Whitened values (n C,), as for `HertzFit.step`.
         steps: The number.
     """
     for _ in range(steps):
-        for fit, white in fits:
-            linearise(inverse, fit)
-            fit.step(white)
-        fits = [one for one in fits if one[0].is_inexact]
+        linearise(inverse, fit)
+        fit.step(white)
+        if not fit.is_inexact:
+            break
 
 
 def update_responses(
