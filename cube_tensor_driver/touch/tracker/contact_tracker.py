@@ -49,8 +49,9 @@ MAX_REGIONS = 32
 """Largest number of regions of contact on one skin; those with the largest pressure are kept."""
 
 MAX_WORK_PER_SCAN = 12.0
-"""Largest computing time of the steps of fits in one scan (set of values of all cubes), in ms, as
-estimated by `WORK_MS`. The remaining steps are made in the next scans; one step is always made."""
+"""Largest computing time of one scan (set of values of all cubes), in ms, as estimated by
+`TRACKING_WORK_MS` and `WORK_MS`. The remaining steps of fits are made in the next scans; one step
+is always made. With 11 instead of 12, twenty fingertips took 46 instead of 44 scans."""
 
 TRACKING_WORK_MS = 0.25
 """CPU time, in ms for each region and scan, of the computation of the present fit for the newest

@@ -181,16 +181,16 @@ class Work(IntEnum):
 WORK_MS = {
     Work.MOVE: 0.2,
     Work.BEGIN: 1.6,
-    Work.SOLVE: 8.5,
+    Work.SOLVE: 7.5,
     Work.CHOOSE: 0.7,
     Work.PREPARE: 6.5,
-    Work.RENEW: 8.5,
-    Work.SHARPEN: 8.5,
+    Work.RENEW: 7.5,
+    Work.SHARPEN: 8.0,
 }
 """Approximate CPU time, in ms, of the steps of a region with `MAX_GRID_CONTACTS` grid contacts. The
 work in a scan is counted with these numbers, not with a clock, so that a recording gives the same
-contacts again. With the functions in C (hertz_response.py), BEGIN takes 0.9 to 1.3 ms and MOVE 0.1
-to 0.3 ms.
+contacts again. They were measured with 24-pad cubes and the functions in C (hertz_response.py).
+BEGIN took 1.2 ms for a single region and 1.3 to 2.2 ms beside nineteen others.
 """
 
 
