@@ -14,7 +14,7 @@ enum { WIDTH = CUBE_CONTACT_LANES, BLOCK = CUBE_CONTACT_BLOCK, SETS = 8 };
 enum { REAL, IMAGINARY, ORDER };                   /* rows of `gather` */
 enum { VALUE, BY_DISTANCE, BY_LOG, BY_LOG_TWICE }; /* derivatives in `differentiate` */
 
-/* Of touch/tracker/hertz_fit.py. */
+/* Of touch/tracker/hertz_response.py. */
 static const float FLATNESS_STEP = 0.2f;
 
 /* `_CUBIC_LAGRANGE` of mechanics/distance_table.py, times 6: coefficients of 1, t, t^2, t^3 in the weights

@@ -4,7 +4,7 @@
 /* Values of cubes under Hertz contacts on the surface, and their derivatives by the contacts.
  *
  * The readable specification in numpy is mechanics/contact_response.py for the responses and
- * touch/tracker/hertz_fit.py for the rest; a test compares both. They add the terms of sums in other
+ * touch/tracker/hertz_response.py for the rest; a test compares both. They add the terms of sums in other
  * orders, so that their results differ by rounding errors.
  *
  * The same bits on every processor, as in cube_scan.h, except that sines, cosines and logarithms are those
@@ -61,7 +61,7 @@ cube_contact_call cube_contact_begin(void);
 bool cube_respond(const cube_contact_call *call);
 
 /* Computes the derivatives of the values by the parameters, and then the values, in `columns`, and whitens
- * them (`_linearise_in_numpy`, which explains `halfway`). Returns false if the arrays do not fit together.
+ * them (`differentiate` in hertz_response.py, which explains `halfway`). Returns false if the arrays do not fit together.
  * The numbers in `variant` are not checked. */
 bool cube_linearise(const cube_contact_call *call, double halfway);
 

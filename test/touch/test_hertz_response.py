@@ -61,9 +61,9 @@ def make_pads() -> SimpleNamespace:
     )
 
 
-@pytest.fixture(scope="module", params=[make_points, make_pads])
+@pytest.fixture(scope="module", params=["points", "pads"])
 def inverse(request):
-    return request.param()
+    return make_points() if request.param == "points" else make_pads()
 
 
 def draw_load(inverse, n_contacts: int, smallest: float = 0.4) -> tuple:
