@@ -10,6 +10,7 @@ import os
 import socket
 import subprocess
 import sys
+import time
 from contextlib import nullcontext
 from types import SimpleNamespace
 
@@ -22,6 +23,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 from cube_tensor_driver.messages.codec import frequency_codec
 from cube_tensor_driver.msg import SkinFrequencies
 from cube_tensor_driver.processes import domain
+from workshop.torture.actions import Actions
 from workshop.torture.mutations import MUTATIONS, edit_source
 from workshop.torture.recorder import TopicLog
 from workshop.torture.torture import LIMITS, find_failures
@@ -136,6 +138,26 @@ def test_faults_wait_for_every_cube():
         messages.append(encoded(stamped(cubes, [[1.0]] * len(cubes), 0, 1), b"skin\0"))
         log.take()
         assert log.has_every_cube() == is_complete, cubes
+
+
+def test_a_restart_of_the_driver_begins_when_the_last_one_is_dead(monkeypatch):
+    """What it had taken before came later, and would end the gap between the two."""
+    dead_ns = []
+
+    def kill(_):
+        time.sleep(0.01)
+        dead_ns.append(time.time_ns())
+
+    node = SimpleNamespace(
+        create_client=lambda *_: None, get_publishers_info_by_topic=lambda topic: []
+    )
+    observer = SimpleNamespace(node=node, spin=lambda *_: None)
+    children = SimpleNamespace(kill=kill, start=lambda _: None)
+    monkeypatch.setattr(Actions, "_activate_driver", lambda *_: True)
+    monkeypatch.setattr(Actions, "_wait_for_stress", lambda _: (True, ""))
+    actions = Actions(observer, children, {"driver": None}, None, None, lambda: None)
+    actions.do({"action": "restart driver"}, 0.0)
+    assert actions.done[0].begin_ns >= dead_ns[0]
 
 
 def test_limits_of_the_figures():

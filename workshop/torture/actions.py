@@ -233,6 +233,8 @@ class Actions:
         dead = self._find_publishers("frequencies")
         dead_transitions = self._find_publishers(TRANSITIONS)
         self._children.kill("driver")
+        # Every sample that is taken from now on can reach only the next driver.
+        self._begin_ns = time.time_ns()
         self._observer.spin(FLUSH_S)
         self._on_driver_killed()
         self._children.start(self._processes["driver"])
