@@ -25,6 +25,7 @@ except ImportError:
 
 __all__ = [
     "SubscriptionEventCallbacks",
+    "has_message_numbers",
     "make_executor",
     "wrap_with_number",
 ]
@@ -50,6 +51,11 @@ def make_executor(warn: Callable[[str], object] = lambda text: None) -> Executor
     return EventsExecutor()
 
 
+def has_message_numbers() -> bool:
+    """Return whether this rclpy passes the sequence numbers of messages to callbacks."""
+    return hasattr(Subscription, "CallbackType")
+
+
 def wrap_with_number(callback: Callable[[Any, int | None], None]) -> Callable[..., None]:
     """Wrap a function that takes a message and its sequence number, as callback of a subscription.
 
@@ -60,7 +66,7 @@ def wrap_with_number(callback: Callable[[Any, int | None], None]) -> Callable[..
     Returns:
         The argument `callback` of `create_subscription`.
     """
-    if not hasattr(Subscription, "CallbackType"):
+    if not has_message_numbers():
         # This release of rclpy passes only the message and no sequence number to callbacks.
         return lambda message: callback(message, None)
 

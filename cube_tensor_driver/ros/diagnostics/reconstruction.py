@@ -17,7 +17,7 @@ from ...core.arrays import AnyArray, Mask
 from ...core.reconstructor import Reconstructor
 from ...core.rows import FrequencyRows, StressRows
 from ...core.status import INVALID, LEFT_OUT, WORDS
-from ..compat import SubscriptionEventCallbacks
+from ..compat import SubscriptionEventCallbacks, has_message_numbers
 from .updater import make_status
 
 if TYPE_CHECKING:
@@ -288,8 +288,8 @@ class LostMessages:
     DDS numbers the messages of each publisher consecutively, so that a gap in the numbers shows a
     lost message. Either the network has lost it, or it was dropped because this process did not
     read its queue in time; DDS does not report messages that were dropped in this way. If rclpy
-    does not provide the numbers, or several publishers send alternately, only the losses that DDS
-    reports are counted. The count continues when the node makes a new subscription.
+    does not provide the numbers, only the losses that DDS reports are counted, and if several
+    publishers send alternately, none. The count continues when the node makes a new subscription.
     """
 
     def __init__(self) -> None:
@@ -323,7 +323,9 @@ class LostMessages:
         self._newest = None
         self._has_several_publishers = False
         self._other_publishers.clear()
-        return SubscriptionEventCallbacks(message_lost=self._on_message_lost)
+        # The event can block a node for ever: https://github.com/ros2/rmw_fastrtps/pull/890.
+        on_message_lost = None if has_message_numbers() else self._on_message_lost
+        return SubscriptionEventCallbacks(message_lost=on_message_lost)
 
     def note_arrival(self, number: int | None) -> None:
         """Record the arrival of a message.
