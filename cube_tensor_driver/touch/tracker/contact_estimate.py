@@ -21,7 +21,7 @@ _MIN_NORMAL_FORCE = 1e-12
 """Smallest normal force, in N, by which the first moment of the pressure is divided to find the
 position of a contact. It replaces any smaller force, which avoids a division by 0."""
 
-HERTZ_MOMENT = 0.2
+_HERTZ_MOMENT = 0.2
 """Second moment of the pressure of a Hertz contact about its centre along one axis, divided by the
 force and the square of the radius: 1/5 for the pressure sqrt(1 - r^2 / a^2)."""
 
@@ -133,13 +133,13 @@ def estimate_contact(
     # The second moment of the pressure is that of the forces at the grid points, plus that of the
     # pressure of one grid contact about its own centre. Its eigenvectors are the axes of the
     # ellipse.
-    own_moment = HERTZ_MOMENT * size**2
+    own_moment = _HERTZ_MOMENT * size**2
     xx, xy, yy = xx - x * x, xy - x * y, yy - y * y
     mean, half_difference = (xx + yy) / 2, (xx - yy) / 2
     radius = math.hypot(half_difference, xy)
     larger_moment = max(mean + radius, 0.0) + own_moment
     smaller_moment = max(mean - radius, 0.0) + own_moment
-    area = math.pi / HERTZ_MOMENT * math.sqrt(larger_moment * smaller_moment)
+    area = math.pi / _HERTZ_MOMENT * math.sqrt(larger_moment * smaller_moment)
     direction = math.atan2(xy, half_difference) / 2
     cosine, sine = math.cos(direction), math.sin(direction)
     by_larger, by_smaller = 1 / larger_moment, 1 / smaller_moment

@@ -41,7 +41,6 @@ from ..inverse import SurfaceInverse
 from ..prior import AMPLITUDE
 from ..surface import make_square_points
 from .contact_estimate import (
-    HERTZ_MOMENT,
     N_MOMENTS,
     ContactEstimate,
     ContactSum,
@@ -73,12 +72,6 @@ MAX_BORDER_REACH_DEPTHS = 4.0
 traction) are placed beyond the border of the skin, divided by the depth of the cubes' centres.
 Cubes do not feel the force of grid contacts much farther away, which would make the force of the
 contact arbitrary."""
-
-MAX_BLOCK_WIDTH = 0.9
-"""Largest side of a square block of four grid contacts (small contacts that make up the traction)
-that acts like one contact with errors of the elastomer, divided by the depth of the cubes' centres.
-Blocks of 0.8 depths hardly change forces and stated deviations; with blocks of 1.1 depths, the
-stated deviations of the forces of rods were 15 % too small."""
 
 SUPPORT_FORCE = 0.2
 """Smallest normal force of a grid contact (one of the small contacts whose sum is the traction)
@@ -284,20 +277,12 @@ class GridFit:
         self.values = values
         self.places = places
         self.spacing = spacing
-        # `_coarsest` is the fit from which `sharpen` has made finer ones, the last of them this one.
+        # `_coarsest` is the fit of the whole region if `sharpen` has made this one from it.
         self._coarsest: GridFit | None = None
         self._first_envelope = np.ones(len(places))
         self._finer: GridFit | None = None
         self.size = _GRID_CONTACT_RADIUS * inverse.depth
         self._peak_width = _PEAK_WIDTH * inverse.depth
-        block_side = 2 if 2 * self.spacing < MAX_BLOCK_WIDTH * inverse.depth else 1
-        steps = np.rint((self.places - self.places[0]) / self.spacing)
-        blocks, block = np.unique(steps // block_side, axis=0, return_inverse=True)
-        self._is_in_block = np.eye(len(blocks))[block.ravel()]
-        # The contact that stands for a block of n x n grid contacts has the same second moments of
-        # pressure. Those of the n x n centres are (n^2 - 1) / 12 times the square of the spacing.
-        moment_of_centres = (block_side**2 - 1) / 12 * self.spacing**2
-        self._block_size = float(np.sqrt(self.size**2 + moment_of_centres / HERTZ_MOMENT))
 
         # The force of a grid contact is its pressure times the square of the spacing, so
         # covariances of forces contain the fourth power of the spacing.
@@ -359,8 +344,7 @@ class GridFit:
         white_response = whitening @ self._response.reshape(*whitening.shape[:2], -1)
         self._white_response = white_response.reshape(len(white), 3, -1)
         self._decomposition = self._decompose(self._first_envelope)
-        values = white[:, None]
-        self._finish(values, self._find_scale(self._decomposition, values))
+        self._finish(white, self._find_scale(self._decomposition, white[:, None]))
         self.is_sharpened = False
         self.is_sharp = False
 
@@ -391,7 +375,7 @@ class GridFit:
         best = self._find_scale(narrower, columns)
         if best.score < present.score - MIN_SCORE_GAIN:
             self._decomposition = narrower
-            self._finish(columns, best)
+            self._finish(white, best)
         else:
             self._finer = self._refine_grid()
             self.is_sharp = self._finer is None
@@ -419,23 +403,6 @@ class GridFit:
         finer._coarsest = self.of_region
         finer._first_envelope = self._compute_envelope(places)
         return finer
-
-    def _finish(self, columns: Array, best: _Scale) -> None:
-        """Compute the posterior with errors of the elastomer, and divide the region into contacts.
-
-        Args:
-            columns: Whitened values (n C, 1 + S), followed by their sensitivities to S properties
-                of the elastomer under the forces of the last fit. They may be missing (n C, 1).
-            best: Scale of the prior that `_find_scale` returns for these columns.
-        """
-        projected = best.projected[:, 0] - best.projected[:, 2:] @ best.errors[:, 0]
-        forces = self._decomposition.basis @ (best.variances * projected)
-        self.forces = forces.reshape(3, -1)
-        # Errors of the elastomer change the values of the new forces differently.
-        white = self.values.whitening @ self._compute_sensitivity()
-        self._white_sensitivity = white.reshape(-1, white.shape[2])
-        self._condition(columns[:, 0])
-        self._separate_contacts()
 
     def step(self, white: Array) -> None:
         """Compute forces and misfit for new values of the same cubes.
@@ -513,27 +480,25 @@ class GridFit:
         root = np.sqrt(self.misfit) * self._propagate(weights)
         return ContactSum(self.places, sizes, self.forces, root.reshape(*self.forces.shape, -1))
 
-    def _compute_sensitivity(self) -> Array:
-        """Return how errors of the elastomer change the values under the present forces.
-
-        The result is that of `LocalValues.compute_sensitivity` (n, C, S). Each block of grid
-        contacts acts like one contact at its centre of pressure.
-        """
-        # The small force is for blocks without any.
-        pressing = np.abs(self.forces[2]) + 1e-12
-        by_contact = np.concatenate([self.forces, pressing * self.places.T, [pressing]])
-        sums = by_contact @ self._is_in_block
-        centres = sums[3:5] / sums[5]
-        return self.values.compute_sensitivity(centres.T, self._block_size, sums[:3])
-
-    def _condition(self, white: Array) -> None:
-        """Compute `posterior` with the scale of the prior that has the largest evidence.
+    def _finish(self, white: Array, first: _Scale) -> None:
+        """Compute the posterior with errors of the elastomer, and divide the region into contacts.
 
         Args:
             white: Whitened values (n C,).
+            first: Scale of the prior that `_find_scale` returns for `_decomposition`, without the
+                errors or with those of the last fit.
         """
         decomposition = self._decomposition
         basis = decomposition.basis
+        exact = first.projected[:, 0] - first.projected[:, 2:] @ first.errors[:, 0]
+        forces = basis @ (first.variances * exact)
+        sensitivity = self.values.compute_sensitivity(
+            self.places,
+            self.size,
+            forces.reshape(3, -1),
+        )
+        white_sensitivity = self.values.whitening @ sensitivity
+        self._white_sensitivity = white_sensitivity.reshape(len(white), -1)
         columns = np.column_stack([white, self._white_sensitivity])
         best = self._find_scale(decomposition, columns)
         scale, variances, projected = best.scale, best.variances, best.projected
@@ -563,6 +528,7 @@ class GridFit:
             occam_term=best.occam_term,
         )
         self.step(white)
+        self._separate_contacts()
 
     def _propagate(self, weights: Array) -> Array:
         """Return a square root (m, n) of the covariance of m weighted sums of the forces.
@@ -597,7 +563,7 @@ class GridFit:
         Args:
             decomposition: Result of `_decompose`.
             columns: Whitened values (n C, 1 + S), followed by their sensitivities to S properties
-                of the elastomer, the depth first.
+                of the elastomer, the depth first, unless these are unknown (n C, 1).
         """
         prior_variances = _SCALES[:, None] ** 2
         projected = decomposition.vectors.T @ (decomposition.design.T @ columns)

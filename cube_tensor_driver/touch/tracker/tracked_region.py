@@ -181,11 +181,11 @@ class Work(IntEnum):
 WORK_MS = {
     Work.MOVE: 0.2,
     Work.BEGIN: 1.6,
-    Work.SOLVE: 7.5,
+    Work.SOLVE: 7.0,
     Work.CHOOSE: 0.7,
-    Work.PREPARE: 6.5,
-    Work.RENEW: 7.5,
-    Work.SHARPEN: 8.0,
+    Work.PREPARE: 6.0,
+    Work.RENEW: 7.0,
+    Work.SHARPEN: 7.5,
 }
 """Approximate CPU time, in ms, of the steps of a region with `MAX_GRID_CONTACTS` grid contacts. The
 work in a scan is counted with these numbers, not with a clock, so that a recording gives the same
