@@ -19,6 +19,9 @@ the largest evidence; the misfit t is chi-squared divided by the number of value
 so that an imperfect model increases the stated deviations. One eigenvalue decomposition of
 K^1/2' B' B K^1/2 gives mean, covariance and evidence for every s.
 
+The number of grid contacts is limited, so those of a wide region lie far apart. Where such a fit
+finds force, a finer grid is tried, and kept if its evidence is greater.
+
 Depth, thickness and Poisson's ratio of the elastomer have errors, too. To first order, they change
 w by further columns, whose factors have the prior N(0, 1).
 
