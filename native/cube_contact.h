@@ -61,8 +61,8 @@ cube_contact_call cube_contact_begin(void);
 bool cube_respond(const cube_contact_call *call);
 
 /* Computes the derivatives of the values by the parameters, and then the values, in `columns`, and whitens
- * them (`differentiate` in hertz_response.py, which explains `halfway`). Returns false if the arrays do not fit together.
- * The numbers in `variant` are not checked. */
+ * them (`differentiate` in hertz_response.py, which explains `halfway`). Returns false if the arrays do not
+ * fit together. The numbers in `variant` are not checked. */
 bool cube_linearise(const cube_contact_call *call, double halfway);
 
 #endif
