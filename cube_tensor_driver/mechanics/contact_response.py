@@ -521,7 +521,12 @@ def _pack(matrices: Array, columns: Index) -> Single:
     Returns:
         Array (variants, 2, n, C) for the real and the imaginary parts; n and C are padded (`_pad`).
     """
-    by_part = matrices[..., columns].reshape(len(matrices), 2, -1, len(columns))
+    by_part = matrices[..., columns].reshape(
+        len(matrices),
+        2,
+        -1,
+        len(columns),
+    )
     return _pad(_pad(by_part), axis=2).astype(np.float32)
 
 

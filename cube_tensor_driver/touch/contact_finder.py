@@ -175,7 +175,12 @@ def make_contact_finder(
 class _InterpolationFinder:
     """Finds contacts in the pressure that is interpolated between the cubes (surface.py)."""
 
-    def __init__(self, settings: ContactSettings, poses: CubePoses, elastomer: Elastomer) -> None:
+    def __init__(
+        self,
+        settings: ContactSettings,
+        poses: CubePoses,
+        elastomer: Elastomer,
+    ) -> None:
         self._surface = Surface(poses, elastomer.depth)
         self._threshold = settings.least
         self.contacts: list[Contact] = []
@@ -224,7 +229,13 @@ class _InverseFinder:
         self._pipeline = Pipeline(calibrations)
         self._left_out = np.zeros(len(calibrations), np.uint32)
         self._errors: Array | None = None
-        self._inverse = SurfaceInverse.from_poses(poses, by_pad, layer, depth, model=model)
+        self._inverse = SurfaceInverse.from_poses(
+            poses,
+            by_pad,
+            layer,
+            depth,
+            model=model,
+        )
         self._tracker = ContactTracker(self._inverse, settings.least)
         self._slip = SlipEstimator(self._inverse)
         self._links = TouchLinks(poses)
@@ -248,7 +259,11 @@ class _InverseFinder:
         # computed again for cubes whose pads in use have changed since the last scan.
         changed = np.flatnonzero(left_out != self._left_out)
         if len(changed):
-            by_pad = compute_noise_by_pad(self._pipeline, changed, left_out[changed])
+            by_pad = compute_noise_by_pad(
+                self._pipeline,
+                changed,
+                left_out[changed],
+            )
             self._inverse.leave_out(changed, by_pad)
             self._left_out = left_out.copy()
         if errors is not self._errors:
@@ -260,7 +275,12 @@ class _InverseFinder:
         else:
             certain = CERTAIN_DEVIATIONS * self._inverse.error_deviation
         self.contacts = self._tracker.update(values, certain)
-        self._slip.update(time_s, values, self.contacts, self._tracker.single_fits)
+        self._slip.update(
+            time_s,
+            values,
+            self.contacts,
+            self._tracker.single_fits,
+        )
         self.touch_id = self._links.link(self.contacts, touches)
 
     def follow(self, time_s: float, values: Array) -> bool:

@@ -87,8 +87,16 @@ class Interpolation:
             Values (cubes, points); NaN on patches for which no neighbouring cube has a value.
         """
         self._update_weights(values)
-        scaled = np.where(self._known, values[:, self._columns] * self._unit_factors, 0.0)
-        near_values = scaled.take(self._near, axis=0).reshape(len(scaled), -1, 1)
+        scaled = np.where(
+            self._known,
+            values[:, self._columns] * self._unit_factors,
+            0.0,
+        )
+        near_values = scaled.take(self._near, axis=0).reshape(
+            len(scaled),
+            -1,
+            1,
+        )
         result = (self._weights @ near_values)[:, :, 0]
         result[~self._known[self._near, 0].any(axis=1)] = np.nan
         return result
@@ -118,16 +126,30 @@ class Interpolation:
         """Compute the weights and the uncertainty of the patches with the indices `chosen` (n,)."""
         near = self._near[chosen]
         known = self._known[near].reshape(len(near), -1)
-        position = np.repeat(self._position[near], self._known.shape[1], axis=1)
+        position = np.repeat(
+            self._position[near],
+            self._known.shape[1],
+            axis=1,
+        )
         directions = self._directions[near].reshape(position.shape)
 
         # The covariances of unknown values with all others are set to 0, so that unknown values get
         # the weight 0.
-        matrix = _compute_covariance(position, directions, position, directions)
+        matrix = _compute_covariance(
+            position,
+            directions,
+            position,
+            directions,
+        )
         matrix *= known[:, :, None] & known[:, None]
         np.einsum("ndd->nd", matrix)[:] += np.where(known, RIDGE, 1.0)
         points = self._patches[chosen]
-        to_points = _compute_covariance(points, np.zeros_like(points), position, directions)
+        to_points = _compute_covariance(
+            points,
+            np.zeros_like(points),
+            position,
+            directions,
+        )
         to_points *= known[:, None]
         weights = np.linalg.solve(matrix, to_points.swapaxes(1, 2)).swapaxes(1, 2)
         explained = np.einsum("nqd,nqd->nq", weights, to_points)

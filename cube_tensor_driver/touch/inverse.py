@@ -295,7 +295,11 @@ class SurfaceInverse:
         # The whole skin is laid flat at once and kept, because contacts stay at few cubes.
         if centre not in self._unrolled:
             everything = np.arange(len(self.poses.position))
-            self._unrolled[centre] = unroll(self.poses, np.array([centre]), everything[None])
+            self._unrolled[centre] = unroll(
+                self.poses,
+                np.array([centre]),
+                everything[None],
+            )
         place, angle = self._unrolled[centre]
         return place[0, cubes], angle[0, cubes]
 

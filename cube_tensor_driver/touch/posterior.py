@@ -229,7 +229,11 @@ class WindowPosteriors:
         square = (weighted * y[self.inner].reshape(weighted.shape)).sum(axis=1)
         excess = square - self.multiply(self.matrices.trace, pad_variance)[:, 0]
         count = known.sum(axis=1)[self.inner].sum(axis=1)
-        return np.where(count > 0, np.maximum(excess, 0) / np.maximum(count, 1), 1.0)
+        return np.where(
+            count > 0,
+            np.maximum(excess, 0) / np.maximum(count, 1),
+            1.0,
+        )
 
 
 def _solve_window(
@@ -277,7 +281,11 @@ def _solve_window(
     covariance = AMPLITUDE**2 * by_cubes.swapaxes(1, 2).reshape(size, size)
     covariance[np.diag_indices(size)] *= 1 + MODEL_ERROR**2
     covariance += block_diag(*(pads @ pads.swapaxes(1, 2)))
-    covariance = np.where(np.outer(observed, observed), covariance, np.eye(size))
+    covariance = np.where(
+        np.outer(observed, observed),
+        covariance,
+        np.eye(size),
+    )
     factor = cholesky(covariance)
 
     # `cross` is K_ty. Its axes are first the cubes, points, components and results.

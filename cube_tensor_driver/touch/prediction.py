@@ -27,7 +27,12 @@ class CubePrediction:
     The errors of the predictions for different cubes are treated as independent.
     """
 
-    def __init__(self, windows: WindowPosteriors, missing: Mask, cube: int) -> None:
+    def __init__(
+        self,
+        windows: WindowPosteriors,
+        missing: Mask,
+        cube: int,
+    ) -> None:
         """Compute the weights of the other values, and the covariance of the prediction.
 
         Args:
@@ -55,7 +60,12 @@ class CubePrediction:
         """Replace the missing values in the values y (cubes, C) of all cubes, which are in Pa."""
         y[self._cube, self._columns] = self._weights @ y[self._near].ravel()
 
-    def add_variance(self, variance: Array, scale: Array, pad_variance: Array) -> None:
+    def add_variance(
+        self,
+        variance: Array,
+        scale: Array,
+        pad_variance: Array,
+    ) -> None:
         """Add the variance that the error of the prediction causes in the pressures.
 
         Args:

@@ -335,7 +335,11 @@ class _Contacts:
         if slips.any():
             self.sums[slips & ~self.is_fitted] = 0.0
             self.is_fitted |= slips
-            self.add_ratios(slips, _compute_lengths(after[:, 3:6]), self.ratio_deviation)
+            self.add_ratios(
+                slips,
+                _compute_lengths(after[:, 3:6]),
+                self.ratio_deviation,
+            )
         return loads
 
     def add_ratios(self, chosen: Mask, ratio: Array, deviation: Array) -> None:
@@ -511,7 +515,12 @@ class SlipEstimator:
         near = scaled[contacts.cubes].reshape(contacts.values.shape)
         change = near - contacts.values
         change[np.isnan(change)] = 0.0  # A value that is missing counts as unchanged.
-        load_change = (contacts.weights @ change[..., None]).reshape(-1, 2, 2, 3)
+        load_change = (contacts.weights @ change[..., None]).reshape(
+            -1,
+            2,
+            2,
+            3,
+        )
         loads = contacts.load + load_change[:, _NEWEST]
         if found is not None:
             contacts.values[:, _NEWEST] = near[:, _NEWEST]
@@ -533,7 +542,12 @@ class SlipEstimator:
         duration = time_s - self._times[places]
         shear_ratio = newest[:, 3:6]
         ratio = _compute_lengths(shear_ratio)
-        moves, slips = contacts.test_lags(motion, duration, shear_ratio, ratio)
+        moves, slips = contacts.test_lags(
+            motion,
+            duration,
+            shear_ratio,
+            ratio,
+        )
         slipped: Mask = np.any(slips, axis=1)
         begins = slipped & ~contacts.slips
         contacts.slips = slipped
@@ -588,7 +602,11 @@ class SlipEstimator:
         force_change, shift = _compute_lengths(loads - contacts.linearised).T
         since_fit = _compute_lengths(loads[:, 1] - contacts.load[:, 1])
         is_near_fit = since_fit <= MIN_SHIFT_DEPTHS * depth
-        max_shift = np.where(is_near_fit, MAX_FITTED_SHIFT_DEPTHS, MAX_SHIFT_DEPTHS)
+        max_shift = np.where(
+            is_near_fit,
+            MAX_FITTED_SHIFT_DEPTHS,
+            MAX_SHIFT_DEPTHS,
+        )
         has_changed = (force_change > MAX_FORCE_CHANGE * force) | (shift > max_shift * depth)
         changed: list[int] = np.flatnonzero(has_changed)[:MAX_LINEARISATIONS].tolist()
         if not changed:
@@ -603,7 +621,13 @@ class SlipEstimator:
         contacts.past[is_lost] = np.nan
         return changed
 
-    def _linearise(self, row: int, loads: Array, scaled: Array, fits: Fits) -> None:
+    def _linearise(
+        self,
+        row: int,
+        loads: Array,
+        scaled: Array,
+        fits: Fits,
+    ) -> None:
         """Compute the weights from changes of the cubes' values to changes of one contact's load.
 
         Args:
@@ -638,7 +662,11 @@ class SlipEstimator:
             forces = loads[near, 0] @ rotation
             centres = (positions[near] - poses.position[home]) @ rotation
             areas = [self._found[number].area for number in near.tolist()]
-            discs = Discs(forces, centres[:, :2], np.log(np.divide(areas, np.pi)) / 2)
+            discs = Discs(
+                forces,
+                centres[:, :2],
+                np.log(np.divide(areas, np.pi)) / 2,
+            )
             fit = HertzFit(inverse, local, discs)
             linearise(inverse, fit)
         weights = fit.compute_weights(cubes)

@@ -157,7 +157,13 @@ class Surface:
 
         near = find_nearest_cubes(poses, NEIGHBOURS)
         length = LENGTH_PER_DEPTH * depth
-        interpolate = partial(Interpolation, poses, near, self._patches, length)
+        interpolate = partial(
+            Interpolation,
+            poses,
+            near,
+            self._patches,
+            length,
+        )
         self._zz = interpolate(PRESSURE if gradients else PRESSURE[:1])
         self._zz_alone = interpolate(PRESSURE[:1])
         self._shear = [interpolate([column]) for column in SHEAR]
@@ -222,7 +228,11 @@ class Surface:
             return []
 
         shear = np.nan_to_num([one.interpolate(values) for one in self._shear])
-        shear = np.einsum("cnq,nic->nqi", shear, self.poses.rotation[:, :, :2])
+        shear = np.einsum(
+            "cnq,nic->nqi",
+            shear,
+            self.poses.rotation[:, :, :2],
+        )
         moment_pressure = np.nan_to_num(-self._zz_alone.interpolate(values))
         uncertainty = self._zz.compute_uncertainty(values)
         on_patches = pressure, moment_pressure, shear, uncertainty

@@ -193,7 +193,12 @@ class Touch:
             ElasticError: The elastomer of the skin file is impossible.
         """
         allowed = "a number above 0, per hour"
-        check_number("false_alarms", false_alarms, lambda x: 0 < x < math.inf, allowed)
+        check_number(
+            "false_alarms",
+            false_alarms,
+            lambda x: 0 < x < math.inf,
+            allowed,
+        )
         skin = as_skin(skin)
         n = len(skin.calibrations)
         rate_hz = max(skin.rate or 0.0, MIN_RATE_HZ)
@@ -212,7 +217,12 @@ class Touch:
         near = find_nearest_cubes(poses, NEIGHBOURS)
         self._estimate = None
         if skin.elastomer is not None:
-            self._estimate = estimate_forces(poses, skin.elastomer, near, covariance)
+            self._estimate = estimate_forces(
+                poses,
+                skin.elastomer,
+                near,
+                covariance,
+            )
 
         # The largest value among the neighbours is found faster if they are the first axis.
         self._near = near.T.copy()
@@ -338,7 +348,12 @@ class Touch:
             covariance = self._pipeline.compute_covariance(cube, mask)
             self._deviation[cube] = np.sqrt(covariance[PRESSURE, PRESSURE])
 
-    def _compute_gain(self, cube: Index | slice, pressure: Array, elapsed_s: Array) -> Array:
+    def _compute_gain(
+        self,
+        cube: Index | slice,
+        pressure: Array,
+        elapsed_s: Array,
+    ) -> Array:
         """Return the gain (k,) of the low-pass filter that gives the slow parts of k cubes.
 
         `_test` has to be called before, with the same arguments.
@@ -356,7 +371,12 @@ class Touch:
         is_kept = self._held | self._touched
         return np.where(is_kept[cube], 0, gain)
 
-    def _test(self, cube: Index | slice, pressure: Array, elapsed_s: Array) -> None:
+    def _test(
+        self,
+        cube: Index | slice,
+        pressure: Array,
+        elapsed_s: Array,
+    ) -> None:
         """Add the pressures of k cubes to their CUSUM sums, and find which cubes are touched.
 
         Args:
@@ -426,7 +446,11 @@ class Touch:
         variance = self._deviation[cube] ** 2 + margin**2 + (GAIN_ERROR * own) ** 2
         variance += (errors[:, 0, PRESSURE] ** 2).sum(axis=1)
         share = np.clip(margin / np.maximum(own, 1e-9), 0, 1)
-        force, force_deviation = self._estimate_forces(cube, share[:, None], errors)
+        force, force_deviation = self._estimate_forces(
+            cube,
+            share[:, None],
+            errors,
+        )
         return Touches(
             stamp_ns=stamp_ns,
             cube=cube,
@@ -524,7 +548,11 @@ class Touch:
         variance += GAIN_ERROR**2 * (values**2 @ weights**2)[:, 0]
         variance += (estimate.squared_error[kind] @ square[:, :, None])[:, :, 0]
         variance += OTHER_LOADS**2 * others @ square.sum(axis=1, keepdims=True)
-        by_value = errors.reshape(len(cube), weights.shape[1], errors.shape[3])
+        by_value = errors.reshape(
+            len(cube),
+            weights.shape[1],
+            errors.shape[3],
+        )
         variance += ((by_value.swapaxes(1, 2) @ weights) ** 2).sum(axis=1)
 
         is_missing = np.isnan(self._slow[near]) != self._unobserved[near]

@@ -101,7 +101,12 @@ def estimate_forces(
     noise_kind = noise_kind.reshape(n)
     # Poses that differ by less than a micrometre or a tenth of a milliradian count as the same.
     keys = np.hstack([place.reshape(n, -1) / 1e-6, angle / 1e-4, noise_kind[near]]).round()
-    _, first, kind = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    _, first, kind = np.unique(
+        keys,
+        axis=0,
+        return_index=True,
+        return_inverse=True,
+    )
 
     own = _make_grid(np.linspace(-MAX_PITCHES, MAX_PITCHES, 9))
     other = _make_grid(np.arange(-5.0, 6.0))
@@ -124,7 +129,11 @@ def _make_grid(line: Array) -> Array:
     return np.column_stack([x.ravel(), y.ravel()])
 
 
-def _solve(signal: Array, n_own: int, covariance: Array) -> tuple[Array, Array, Array]:
+def _solve(
+    signal: Array,
+    n_own: int,
+    covariance: Array,
+) -> tuple[Array, Array, Array]:
     """Return weights, noise variance and squared error (`ForceEstimate`) for one kind of cube.
 
     Args:

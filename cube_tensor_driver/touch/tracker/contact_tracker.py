@@ -269,7 +269,12 @@ class ContactTracker:
         if is_changed and regions:
             distances = self._measure_region_distances()
             are_near = distances < NEIGHBOUR_REACH_PITCHES * self._inverse.pitch
-            rows = zip(regions, are_near.tolist(), distances.min(axis=1).tolist(), strict=True)
+            rows = zip(
+                regions,
+                are_near.tolist(),
+                distances.min(axis=1).tolist(),
+                strict=True,
+            )
             for region, is_near, region.gap in rows:
                 region.near = list(compress(regions, is_near))
 

@@ -310,7 +310,12 @@ class GridFit:
         self.is_sharp = False
 
     @classmethod
-    def cover(cls, inverse: SurfaceInverse, points: Index, values: LocalValues) -> GridFit:
+    def cover(
+        cls,
+        inverse: SurfaceInverse,
+        points: Index,
+        values: LocalValues,
+    ) -> GridFit:
         """Place grid contacts on a whole region.
 
         Args:
@@ -322,7 +327,11 @@ class GridFit:
         around = np.flatnonzero(is_around)
         region_points = unroll_points(inverse, values.home, points)
         points_around = unroll_points(inverse, values.home, around)
-        places, spacing = _place_grid_contacts(region_points, points_around, inverse)
+        places, spacing = _place_grid_contacts(
+            region_points,
+            points_around,
+            inverse,
+        )
         return cls(inverse, values, places, spacing)
 
     @property
@@ -481,7 +490,12 @@ class GridFit:
         sizes = np.full(len(self.places), self.size)
         weights = np.eye(self.forces.size).reshape(-1, *self.forces.shape)
         root = np.sqrt(self.misfit) * self._propagate(weights)
-        return ContactSum(self.places, sizes, self.forces, root.reshape(*self.forces.shape, -1))
+        return ContactSum(
+            self.places,
+            sizes,
+            self.forces,
+            root.reshape(*self.forces.shape, -1),
+        )
 
     def _finish(self, white: Array, first: _Scale) -> None:
         """Compute the posterior with errors of the elastomer, and divide the region into contacts.
@@ -720,7 +734,12 @@ def _place_grid_contacts(
         is_beyond_border = (to_region < reach) & (to_skin > margin)
         return np.asarray((to_region < margin) | is_beyond_border)
 
-    return _make_grid(region, reach, GRID_STEP * inverse.depth, is_in_region_or_beyond_border)
+    return _make_grid(
+        region,
+        reach,
+        GRID_STEP * inverse.depth,
+        is_in_region_or_beyond_border,
+    )
 
 
 def _make_grid(

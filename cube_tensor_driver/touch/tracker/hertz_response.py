@@ -58,11 +58,21 @@ def respond(
     if native is None:
         positions, angles, sizes, forces = _combine(place, angle, discs)
         variants = np.tile(variant, len(sizes) // len(place))
-        values = response.compute_response_to_forces(positions, angles, variants, sizes, forces)
+        values = response.compute_response_to_forces(
+            positions,
+            angles,
+            variants,
+            sizes,
+            forces,
+        )
         return _sum_over_contacts(inverse.select(values), len(place))
     tables = response.collect_tables(inverse.columns)
     result = np.empty((len(place), 1, len(inverse.columns)))
-    native.respond(*tables[:4], *_convert(place, angle, variant, discs), result)
+    native.respond(
+        *tables[:4],
+        *_convert(place, angle, variant, discs),
+        result,
+    )
     return result[:, 0]
 
 
@@ -91,7 +101,12 @@ def respond_to_errors(
     scale, _, _, _, *tables = response.collect_tables(inverse.columns)
     result = np.empty((len(place), response.n_quantities, len(inverse.columns)))
     no_variant = np.zeros(len(place), np.intp)
-    native.respond(scale, *tables, *_convert(place, angle, no_variant, discs), result)
+    native.respond(
+        scale,
+        *tables,
+        *_convert(place, angle, no_variant, discs),
+        result,
+    )
     return result
 
 
@@ -126,7 +141,14 @@ def differentiate(
     # The factor is the same for all values, so it only scales the error that the next step finds.
     halfway = 1 + depth_error / 2
     if native is None:
-        columns = _differentiate_in_numpy(inverse, place, angle, variant, discs, halfway)
+        columns = _differentiate_in_numpy(
+            inverse,
+            place,
+            angle,
+            variant,
+            discs,
+            halfway,
+        )
         return columns, whitening @ columns
     tables = inverse.contact_response.collect_tables(inverse.columns)
     arrays = _convert(place, angle, variant, discs)
@@ -134,7 +156,16 @@ def differentiate(
     n_padded = n_columns + -n_columns % _BLOCK
     columns = np.empty((*whitening.shape[:2], n_padded))
     white = np.empty_like(columns)
-    native.linearise(halfway, *tables[:4], *arrays, None, *tables[4:], whitening, columns, white)
+    native.linearise(
+        halfway,
+        *tables[:4],
+        *arrays,
+        None,
+        *tables[4:],
+        whitening,
+        columns,
+        white,
+    )
     return columns[..., :n_columns], white[..., :n_columns]
 
 
@@ -189,17 +220,37 @@ def _differentiate_in_numpy(
     response = inverse.contact_response
     positions, angles, sizes, forces = _combine(place, angle, discs)
     variants = np.tile(variant, n_contacts)
-    slopes = response.compute_response_slopes(positions, angles, variants, sizes, forces)
+    slopes = response.compute_response_slopes(
+        positions,
+        angles,
+        variants,
+        sizes,
+        forces,
+    )
     # The derivative by the flatness is the response to a contact minus that to a mixture of a wider
     # and a narrower one (see `FLATNESS_STEP`, h). With the derivatives `first` and `second` by the
     # logarithm of the radius, it is h^2 (first - second / 2), to order h^2.
     first, second = slopes[:, 5], slopes[:, 6]
     slopes[:, 6] = FLATNESS_STEP**2 * (first - second / 2)
-    by_contact = inverse.select(slopes).reshape(n_contacts, n_cubes, N_PARAMETERS, -1)
-    of_contacts = by_contact.transpose(1, 3, 0, 2).reshape(n_cubes, len(inverse.columns), -1)
+    by_contact = inverse.select(slopes).reshape(
+        n_contacts,
+        n_cubes,
+        N_PARAMETERS,
+        -1,
+    )
+    of_contacts = by_contact.transpose(1, 3, 0, 2).reshape(
+        n_cubes,
+        len(inverse.columns),
+        -1,
+    )
     values = np.einsum("jnpc,jp->nc", by_contact[:, :, :3], discs.forces)
 
-    changes = response.compute_sensitivity(positions / halfway, angles, sizes / halfway, forces)
+    changes = response.compute_sensitivity(
+        positions / halfway,
+        angles,
+        sizes / halfway,
+        forces,
+    )
     changes[:, :, len(STRESS) :] /= halfway
     of_elastomer = _sum_over_contacts(inverse.select(changes), n_cubes).swapaxes(1, 2)
     return np.concatenate([of_contacts, of_elastomer, values[:, :, None]], axis=2)

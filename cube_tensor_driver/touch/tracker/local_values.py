@@ -313,7 +313,12 @@ class LocalValues:
         """
         log_sizes = np.full(len(centres), np.log(size))
         discs = Discs(forces.T, centres, log_sizes)
-        changes = respond_to_errors(self._inverse, self.place, self.angle, discs)
+        changes = respond_to_errors(
+            self._inverse,
+            self.place,
+            self.angle,
+            discs,
+        )
         return np.asarray(changes.swapaxes(1, 2))
 
 

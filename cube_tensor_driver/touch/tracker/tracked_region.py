@@ -642,7 +642,11 @@ class TrackedRegion:
                 self._noise.update(self._noise.scaled, cubes)
                 values = self._collect(self.home, cubes)
                 if values.count:
-                    self._prepared = GridFit.cover(inverse, self.points, values)
+                    self._prepared = GridFit.cover(
+                        inverse,
+                        self.points,
+                        values,
+                    )
                 return
 
     def _solve_grid(self) -> None:
@@ -693,7 +697,12 @@ class TrackedRegion:
         self._first_misfit = max(fit.shape_misfit, lowest_misfit)
 
 
-def iterate(inverse: SurfaceInverse, fit: HertzFit, white: Array, steps: int) -> None:
+def iterate(
+    inverse: SurfaceInverse,
+    fit: HertzFit,
+    white: Array,
+    steps: int,
+) -> None:
     """Make Gauss-Newton steps until the fit has converged, but at most a number of them.
 
     Args:
@@ -731,7 +740,13 @@ def update_responses(
         if len(stale):
             home, discs = region.discs
             place, angle = inverse.unroll(home, stale)
-            response = respond(inverse, place, angle, inverse.variant[stale], discs)
+            response = respond(
+                inverse,
+                place,
+                angle,
+                inverse.variant[stale],
+                discs,
+            )
             # On a bent skin, cubes that face away from a contact do not respond to it.
             is_facing = normals[stale] @ normals[home] > MIN_FACING
             region.take_response(stale, response * is_facing[:, None])
