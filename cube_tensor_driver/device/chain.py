@@ -364,6 +364,11 @@ class LiveLinks:
                 record.account.add_stats(frame)
             elif isinstance(frame, Ack) and frame.request == Command.START:
                 record.account.expect_restart()
+            elif isinstance(frame, Ack) and frame.request == Command.SET_PERIOD:
+                self._add_samples(read, samples)
+                samples = []
+                record.clock.forget_period()
+                record.track.is_native_allowed = False
         self._add_samples(read, samples)
 
     def _add_samples(self, read: LinkFrames, samples: Sequence[Sample]) -> None:

@@ -21,7 +21,7 @@ from cube_tensor_driver.device.clock.hub_clock import CLOCK_SET, CLOCK_STANDS_ST
 from cube_tensor_driver.device.links.link import LinkConfig
 from cube_tensor_driver.device.links.reader import LinkFrames
 from cube_tensor_driver.device.scans.cube_table import CubeAddress
-from cube_tensor_driver.device.wire.protocol import Hello
+from cube_tensor_driver.device.wire.protocol import Ack, Command, Hello, Result
 
 AT_S = 10.0  # when the clock is set
 SEEN_S = 0.25  # limit of the issue
@@ -200,3 +200,23 @@ def test_the_doubt_is_in_the_rows() -> None:
     assert [number for number, _ in rows] == list(range(1000))
     assert {status for _, status in rows} == {0, STAMP}
     assert doubtful[0] == 500 and doubtful[-1] < 500 + 100 * SEEN_S
+
+
+def test_a_step_after_another_sample_period_is_measured_with_that_period() -> None:
+    """The rate falls from 500 to 250 Hz, then the clock is set: stamps were wrong by 2 ms."""
+    stamps = {}
+    live = LiveLinks(
+        [LinkConfig("a", "/dev/null")],
+        [CubeAddress("c", 0, 0, None, 2)],
+        lambda rows: stamps.update(
+            zip(rows.sequence.tolist(), rows.stamp_ns.tolist(), strict=True)
+        ),
+    )
+    live.receive([LinkFrames(0, 0, [Hello(1, 0, 2, 2000, np.array([5], "<u8"))])])
+    taken_us = {k: 2000 * k if k < 1000 else 4000 * k - 2_000_000 for k in range(2000)}
+    for k, time_us in taken_us.items():
+        ack = [Ack(Command.SET_PERIOD, Result.DONE, 4000)] if k == 1000 else []
+        frame = sample_frame(k, time_us + (3_000_000 if k >= 1200 else 0))
+        live.receive([LinkFrames(0, EPOCH_NS + 1000 * time_us, [*ack, frame])])
+    errors_ns = [stamps[k] - EPOCH_NS - 1000 * taken_us[k] for k in range(1300, 2000)]
+    assert np.abs(errors_ns).max() < 10_000

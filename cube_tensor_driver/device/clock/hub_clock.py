@@ -111,6 +111,11 @@ class HubClock:
         self._count_step()
         self._restart()
 
+    def forget_period(self) -> None:
+        """Measure the sample period anew, because the hub was given another one."""
+        self.track.reference = -1
+        self.track.period_us = 0.0
+
     def shift(self, step_ns: int) -> None:
         """Move all stored host times by the step, in ns, by which the host's clock was set."""
         self.track.first_ns += step_ns
@@ -185,8 +190,7 @@ class HubClock:
         """Discard the clock line (host time over device time) and all samples; keep the drift and
         the last stamp."""
         self.track.newest_ns = NEVER
-        self.track.reference = -1
-        self.track.period_us = 0.0
+        self.forget_period()
         self.line.restart()
         self._step_us = 0
 
