@@ -70,7 +70,7 @@ class Interpolation:
         self._unit_factors = np.where(np.arange(width) > 0, length, 1.0)
         self._position = poses.position / length
         self._patches = patches / length
-        # The direction of the derivative is 0 for the quantity itself.
+        # The direction 0 stands for the quantity itself instead of a derivative.
         self._directions = np.zeros((n, width, 3))
         self._directions[:, 1:] = poses.rotation[:, :, : width - 1].swapaxes(1, 2)
         self._known = np.zeros((n, width), bool)

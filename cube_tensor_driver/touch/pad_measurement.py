@@ -64,9 +64,10 @@ _N_DISTANCES = 400
 of the Bessel functions up to the largest distance (half the width of the finite element body)."""
 
 _MATCH_TOLERANCE = 1e-6
-"""Largest difference up to which the cube and pads of a calibration count as those of the influence
-functions. It applies to the relative difference of the cubes' sides, to the positions and sizes of
-pads (sensing elements) in units of half a side, and to their unit normals."""
+"""Largest difference between a calibrated pad (sensing element) and a pad with a known influence
+function (stress under a force of 1 N) at which they count as the same. It applies to the positions
+and sizes of pads in units of half the cube's side, to their unit normals, and to the relative
+difference of the cubes' sides."""
 
 
 def model_pads(

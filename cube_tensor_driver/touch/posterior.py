@@ -65,10 +65,12 @@ follows from the values of the cubes.
 
 
 class _WindowMatrices(NamedTuple):
-    """Matrices of all kinds of windows (cubes nearest to one cube) for the formulas of this file.
+    """Matrices of all kinds of windows (cubes nearest to one cube).
 
-    A window has W cubes with C values and P pads each. The traction is computed at q points around
-    its centre cube. The first cubes of the window are its inner cubes (`INNER_CUBES`).
+    The head of this file defines the matrices G, P and B (noise), and the scale s^2 of the prior
+    variances. A window has W cubes with C values and P pads each. The traction is computed at q
+    points around its centre cube. The first cubes of the window are its inner cubes
+    (`INNER_CUBES`).
 
     Attributes:
         gain: Matrices G (kinds, q, 4, W C) from the values of the window's cubes to the results at
@@ -78,8 +80,8 @@ class _WindowMatrices(NamedTuple):
         by_pad: Variances (kinds, q, 2, W P) in Pa^2 of these pressures by the noise of each pad,
             the squares of G B.
         precision: Matrices P (kinds, inner C, inner C) of the values of the inner cubes, in 1/Pa^2.
-        trace: Contributions diag(B' P B) (kinds, 1, inner P) of the pads of the inner cubes to the
-            scale.
+        trace: Diagonals of B' P B (kinds, 1, inner P), by which the noise of each pad of the inner
+            cubes reduces s^2.
     """
 
     gain: Single

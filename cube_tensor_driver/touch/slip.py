@@ -104,8 +104,8 @@ of this contact so far. Friction has held the largest ratio, and the coefficient
 is rarely less than half of the static one."""
 
 MAX_RATIO_CHANGE = 0.2
-"""Largest change of the ratio of shear and normal force of a contact that slips, over the duration
-(`LAGS`) of the motion that shows the slip, divided by the ratio."""
+"""Largest change of the ratio of shear and normal force, divided by the ratio, during a motion that
+counts as slip. With a larger change, it may be the motion of a sticking body that tilts."""
 
 MIN_COSINE = 0.8
 """Smallest cosine of the angle between motion and shear force of a contact that slips. A body that
@@ -135,12 +135,14 @@ centres, up to which the derivatives need not be exact, because only this small 
 with them. `MAX_FITTED_SHIFT_DEPTHS` then replaces `MAX_SHIFT_DEPTHS`."""
 
 MAX_FITTED_SHIFT_DEPTHS = 0.5
-"""Shift of a contact that the contact tracker has just fitted (`MIN_SHIFT_DEPTHS`) after which it
-is linearised again, measured as in `MAX_SHIFT_DEPTHS`."""
+"""Value that replaces `MAX_SHIFT_DEPTHS` (shift after which the derivatives of the cubes' values
+are computed again) while a contact has moved by at most `MIN_SHIFT_DEPTHS` since its last fit by
+the contact tracker."""
 
 MAX_FORCE_CHANGE = 0.3
-"""Change of the force of a contact, divided by the force, after which it is linearised again,
-because the radius of the contact changes with the force."""
+"""Change of the force of a contact, divided by the force, after which the derivatives of the cubes'
+values by its force and position are computed again. They depend on the radius of the contact, which
+changes with the force."""
 
 MAX_JUMP = 0.6
 """Change of the force of a contact since it was linearised, divided by the force, above which its
@@ -165,14 +167,17 @@ stresses like partial slip, by as much if it is 1 mm. A motion of 0.1 mm gave va
 simulations of flat punches, which have no partial slip."""
 
 PARTIAL_DEVIATION = 0.01
-"""Largest standard deviation of `Slip.partial` due to the noise of the pads. If it is larger, as it
-is while the shear force has changed little, `Slip.partial` is unknown (NaN)."""
+"""Largest standard deviation of `Slip.partial`, a ratio that measures partial slip, due to the
+noise of the pads. While it is larger, because the shear force has changed little, `Slip.partial` is
+unknown (NaN)."""
 
 _NEWEST = 0
-"""Index of the newest linearisation of a contact."""
+"""Index on the second axis of arrays of `_Contacts`: the newest derivatives of a contact's load by
+the values of the cubes."""
 
 _FIRST = 1
-"""Index of the linearisation with which the fit of `Slip.partial` has begun."""
+"""Index on the second axis of arrays of `_Contacts`: the derivatives of a contact's load by the
+values of the cubes with which the fit of `Slip.partial` has begun."""
 
 _SHEAR_TERMS = np.repeat([[0, 0, 1, 1], [0, 0, 0, 1]], [1, 1, 3, 3], axis=1)
 """Masks (2, 8) of the terms 1, n, q and |q| q: those of the shear force, and the last one."""
@@ -227,14 +232,14 @@ class _Contacts:
 
     V values of the cubes near a contact determine its load (2, 3): force in N and position in m.
     The second axis (2) of `cubes`, `weights`, `values` and `pad_variance` stands for two
-    linearisations: the newest one (`_NEWEST`), and that with which the fit of `Slip.partial` has
-    begun (`_FIRST`). The latter is used for the whole fit, because other weights would give another
-    shear force even for the same values.
+    linearisations (derivatives of the load by the values): the newest one (`_NEWEST`), and that
+    with which the fit of `Slip.partial` has begun (`_FIRST`). The latter is used for the whole fit,
+    because other weights would give another shear force even for the same values.
 
     Attributes:
         normal: Unit normals (n, 3) out of the skin.
         ratio_deviation: Standard deviations s (n,) of the ratio of shear and normal force.
-        largest_ratio: Largest ratios (n,) that are certain.
+        largest_ratio: Largest values (n,) so far of this ratio minus 3 s.
         slips: Whether each contact slips (n,).
         is_fitted: Whether `sums` contain ratios of loads that the tracker has found (n,).
         sums: Sums (n, 3) of 1 / s, 1 / s^2 and ratio / s^2 over the scans in which a contact slips.
@@ -246,7 +251,8 @@ class _Contacts:
         load: Loads (n, 2, 3) at the newest `values`.
         linearised: Loads (n, 2, 3) for which the newest `weights` were computed.
         past: Motion states (n, scans, 7) of the last scans, from `_compute_motion_states`.
-        terms: Terms (n, 8) of the fit of `Slip.partial` in the newest scan: 1, n, q and |q| q.
+        terms: Terms (n, 8) of the fit of `Slip.partial` in the newest scan: 1, n, q and |q| q, with
+            the changes n of the normal force and q of the shear force (head of this file).
         equations: Normal equations (n, 8, 8 + V) of this fit: sums over its scans of the products
             of the terms with the terms and with the changes of the values.
         partial: Results (n,) of this fit.
@@ -322,8 +328,9 @@ class _Contacts:
         """
         loads = np.array([(one.force, one.position) for one in found])
         self.load = loads.copy()
-        # The tracker has fitted the loads again. This corrects the errors of `followed`. The past
-        # states get the same correction, so that it does not look like motion.
+        # The tracker has fitted the loads again, which corrects the errors that `followed` has
+        # gathered since the last fit. The past states get the same correction, so that it does not
+        # look like motion.
         both = np.stack([followed, loads])
         before, after = _compute_motion_states(both, self.normal)
         self.past += (after - before)[:, None]
@@ -418,7 +425,8 @@ class _Contacts:
         """Test whether each contact has moved, and whether it has slipped, over each of the `LAGS`.
 
         Args:
-            motion: Changes (n, lags, 7) of the motion states over each lag.
+            motion: Changes (n, lags, 7) over each lag of position, force ratio and logarithm of the
+                normal force (`_compute_motion_states`).
             duration: Durations (lags,) of the lags in s.
             shear_ratio: Shear forces (n, 3) in this scan, divided by the normal forces.
             ratio: Their lengths (n,).

@@ -42,10 +42,9 @@ FALSE_ALARMS = 1.0
 """Default rate of touches found in noise alone, per hour, of the whole skin."""
 
 MIN_RATE_HZ = 1000.0
-"""Smallest sampling rate of each cube, in Hz, for which the limit of the CUSUM is computed. If the
-skin file states a lower rate or none, the limit is that for this rate, and false alarms are rarer
-than chosen. So a recording, which does not state its rate, gives the same touches as the sensor.
-"""
+"""Smallest sampling rate of each cube, in Hz, for which the limit of the CUSUM is computed. Lower
+rates get the limit for this rate, which makes false alarms rarer than chosen. So do recordings,
+which do not state their rate: they give the same touches as a sensor of up to this rate."""
 
 TIME_CONSTANT_S = 1.0
 """Time constant, in s, of the high-pass that removes slow drift from the pressure of a cube. The
@@ -327,7 +326,7 @@ class Touch:
         return self._locate(int(rows.stamp_ns.min()))
 
     def _restart(self, cubes: Index) -> None:
-        """Forget the slow parts of cubes; the next samples of the cubes start them again."""
+        """Let slow parts (averages that follow slow drift) of cubes restart at the next samples."""
         self._slow[cubes] = np.nan
         self._count[cubes] = 0
         # While a slow part is held, it is not averaged over more samples. After the restart, it

@@ -47,8 +47,9 @@ MAX_PITCHES = 1.0
 neighbouring cubes). Half a pitch would be enough for small loads; wide ones reach farther."""
 
 MIN_OTHER_PITCHES = 2.0
-"""Smallest distance between the cube and the other loads that the estimate takes into account, in
-pitches (distances of neighbouring cubes). It is the larger one of the distances along x and y."""
+"""Smallest distance at which the estimate assumes other loads, from the cube below the load whose
+force is estimated, in pitches (distances of neighbouring cubes). Of the distances along x and y,
+the larger one counts."""
 
 
 class ForceEstimate(NamedTuple):

@@ -30,7 +30,8 @@ contact between two touches could change in every scan (set of values of all cub
 
 
 class TouchLinks:
-    """Links contacts to the touches nearest to them."""
+    """Links each contact that the contact tracker has found to the nearest touch, which is detected
+    in every scan (set of values of all cubes)."""
 
     def __init__(self, poses: CubePoses) -> None:
         """Start without contacts, on a skin with cubes at these poses."""

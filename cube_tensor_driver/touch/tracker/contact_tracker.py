@@ -396,7 +396,9 @@ class ContactTracker:
         weight: Array,
         field: TractionField,
     ) -> ContactEstimate:
-        """Integrate the field around a region over n points, in the frame of its home cube.
+        """Integrate the field around a region over n points.
+
+        The result is in the frame of the home cube, the cube around which the skin is laid flat.
 
         Args:
             region: The region.

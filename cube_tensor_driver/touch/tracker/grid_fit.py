@@ -520,8 +520,8 @@ class GridFit:
         best = self._find_scale(decomposition, columns)
         scale, variances, projected = best.scale, best.variances, best.projected
 
-        # The errors of the elastomer add two parts to the covariance: one for the estimated errors
-        # and one for the error of the depth.
+        # Errors of the elastomer's properties add two parts to the covariance: one for the error of
+        # the depth, and one for the other errors, which are estimated together with the forces.
         by_column = basis @ (variances[:, None] * projected[:, 1:])
         by_depth = by_column[:, :1] - by_column[:, 1:] @ best.errors[:, 1:]
         cholesky_factor = np.linalg.cholesky(best.information)
@@ -579,15 +579,16 @@ class GridFit:
 
         Args:
             decomposition: Result of `_decompose`.
-            columns: Whitened values (n C, 1 + S), followed by their sensitivities to S properties
-                of the elastomer, the depth first, unless these are unknown (n C, 1).
+            columns: Whitened values in the first column, and their sensitivities to S properties of
+                the elastomer, the depth first, in the others (n C, 1 + S). Only the values (n C, 1)
+                if the sensitivities are unknown.
         """
         prior_variances = _SCALES[:, None] ** 2
         projected = decomposition.vectors.T @ (decomposition.design.T @ columns)
 
-        # `products` are the products columns' W columns for every scale s, with the matrix
-        # W = (1 + s^2 B K B')^-1. By the Woodbury identity, they are columns' columns minus the
-        # part that the prior of the forces explains.
+        # With X = `columns`, `products` are X' W X for every scale s, with the matrix
+        # W = (1 + s^2 B K B')^-1. By the Woodbury identity, they are X' X minus the part that the
+        # prior of the forces explains.
         signal_to_noise = prior_variances * decomposition.eigenvalues
         weights = prior_variances / (1 + signal_to_noise)
         explained_by_forces = (projected.T * weights[:, None]) @ projected

@@ -136,9 +136,10 @@ def differentiate(
         deviations. The values are the last column. Then the same array, whitened.
     """
     # The response is not linear in the depth. Its change from the stated depth to the one found
-    # follows from the derivative halfway between these two depths. In a half space, this derivative
-    # is that at the stated depth for a load whose lengths are divided by `halfway`, times a factor.
-    # The factor is the same for all values, so it only scales the error that the next step finds.
+    # follows from the derivative halfway between these two depths. In a half space, this is the
+    # derivative at the stated depth, if the lengths of the load are divided by `halfway`, times a
+    # factor. The factor is left out: as it is the same for all values, it only scales the error of
+    # the depth that the next Gauss-Newton step finds.
     halfway = 1 + depth_error / 2
     if native is None:
         columns = _differentiate_in_numpy(
@@ -215,7 +216,7 @@ def _differentiate_in_numpy(
     discs: Discs,
     halfway: float,
 ) -> Array:
-    """Compute the derivatives and values (n, C, p + 1) of `differentiate`."""
+    """Compute the first array (n, C, p + 1) of `differentiate`, with derivatives and values."""
     n_contacts, n_cubes = len(discs.forces), len(place)
     response = inverse.contact_response
     positions, angles, sizes, forces = _combine(place, angle, discs)

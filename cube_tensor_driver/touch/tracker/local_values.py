@@ -228,7 +228,7 @@ class LocalValues:
 
     @property
     def is_stale(self) -> bool:
-        """Whether the noise of the cubes or the disturbance has changed since `refresh`."""
+        """Whether the noise, or the disturbance by other contacts, has changed since `refresh`."""
         total = float(self.disturbance.sum())
         larger = max(self._total_disturbance, total)
         smaller = min(self._total_disturbance, total)

@@ -106,13 +106,12 @@ which the skin is laid flat for the fit, in pitches (distances of neighbouring c
 distance, the cube nearest to the contacts becomes the home cube."""
 
 MAX_STALE_CHANGE = 0.06
-"""Factor in the limit from which on a change of a region's contacts makes it necessary to compute
-again the stress that they cause in distant cubes.
+"""Relative change of a region's contacts, divided by the relative standard deviation (`FIT_ERROR`
+or `START_ERROR`) of the stress that they cause in distant cubes, from which on this stress is
+computed again. Until then, it is outdated by much less than its standard deviation.
 
-The limit is this factor times the relative standard deviation of this stress (`FIT_ERROR` or
-`START_ERROR`), so that the outdated stress is wrong by much less than assumed anyway. Two
-changes are compared with the limit: the shift of a contact divided by the distance of the nearest
-other region, and the change of a force divided by the largest force.
+The relative change is the larger one of two numbers: the shift of a contact divided by the distance
+of the nearest other region, and the change of a force divided by the largest force.
 """
 
 COARSE_DEVIATION = 0.1
@@ -516,7 +515,7 @@ class TrackedRegion:
         return Work.PREPARE if may_prepare else Work.NONE
 
     def estimate_ms(self, work: Work) -> float:
-        """Return the computing time in ms that a step of this region takes."""
+        """Return the computing time, in ms, of a step of the kind `work` of this region's fit."""
         if work in (Work.MOVE, Work.BEGIN, Work.CHOOSE):
             return WORK_MS[work]
         fit = self._prepared or self.fit
@@ -571,7 +570,8 @@ class TrackedRegion:
             self.store_response()
 
     def store_response(self) -> None:
-        """Store the response to this region that its fit predicts for the cubes of the fit."""
+        """Store the response to this region in the cubes of its fit, as predicted by the fit. The
+        fits of other regions subtract it."""
         if self.fit is not None:
             self.response[self.fit.values.cubes] = self.fit.explained
 
@@ -650,7 +650,7 @@ class TrackedRegion:
                 return
 
     def _solve_grid(self) -> None:
-        """Fit the forces of the prepared grid contacts, or else those of the present fit again."""
+        """Fit the forces of grid contacts: those prepared or, if there are none, those of `fit`."""
         self._is_tried = True
         fit = self._prepared or self.fit
         self._prepared = None
