@@ -40,8 +40,8 @@ need more memory and not less time."""
 class Interpolation:
     """Interpolates one quantity from the cubes to a patch of points around each cube.
 
-    The weights of the interpolation depend only on which values are known. For each patch, they are
-    computed again only if this has changed for one of its neighbouring cubes.
+    The weights of the interpolation depend only on which values are known. The weights of a patch
+    are computed again only if a value of a neighbouring cube has become known or unknown.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class Interpolation:
         return self._deviation
 
     def _update_weights(self, values: Array) -> None:
-        """Compute the weights of the patches for which other values are known than before."""
+        """Compute the weights of the patches near which values have become known or unknown."""
         known = np.isfinite(values[:, self._columns])
         if np.array_equal(known, self._known):
             return
@@ -176,7 +176,8 @@ def _compute_covariance(a: Array, u: Array, b: Array, v: Array) -> Array:
     u_dot_v = np.einsum("nai,nbi->nab", u, v)
     is_value = np.all(u == 0, axis=2)[:, :, None]
     is_other_value = np.all(v == 0, axis=2)[:, None]
-    # The covariance φ = s^(-5/2) depends on s = 1 + r². Its derivatives by s follow below.
+    # The covariance φ = s^(-5/2) depends on s = 1 + r². `phi1` and `phi2` are its first and second
+    # derivatives by s.
     s = 1 + np.einsum("nabi,nabi->nab", offset, offset)
     phi = s**-2.5
     phi1 = -2.5 * phi / s

@@ -39,9 +39,9 @@ traction is computed at 2 x 2 points of the surface around each cube. With a lar
 ball that pressed with 0.3 N above a cube, between the four points, was not found."""
 
 MIN_ERROR_CHANGE = 0.1
-"""Smallest change of the errors given to `SurfaceInverse.state_errors`, divided by the largest of
-them, that has an effect. Smaller changes are ignored, because the noise of all cubes must be
-computed again after each change."""
+"""Smallest change of the errors that `SurfaceInverse.state_errors` sets (errors of the values other
+than noise), divided by the largest of these errors. Smaller changes are ignored, because the noise
+of all cubes must be computed again after each change."""
 
 
 class TractionField(NamedTuple):
@@ -276,7 +276,8 @@ class SurfaceInverse:
         return self.select(np.asarray(values)) * self._unit_factors
 
     def select(self, components: Array) -> Array:
-        """Return the C components `columns` (..., C) of all 15 (..., 15), without a copy if all."""
+        """Return the C components `columns` (..., C) of all 15 components (..., 15). If C is 15,
+        the argument itself is returned, not a copy."""
         if len(self.columns) == components.shape[-1]:
             return components
         return np.asarray(components[..., self.columns])
@@ -292,7 +293,8 @@ class SurfaceInverse:
             Positions (n, 2) in m and rotations (n,) about z in rad of these cubes, in the frame of
             the centre cube.
         """
-        # The whole skin is laid flat at once and kept, because contacts stay at few cubes.
+        # The whole skin is laid flat at once, and the result is kept: contacts stay near few cubes,
+        # so the same cubes are the centre again and again.
         if centre not in self._unrolled:
             everything = np.arange(len(self.poses.position))
             self._unrolled[centre] = unroll(

@@ -6,14 +6,14 @@ The influence function of a pad (one of a cube's sensing elements) is the stress
 under a force of 1 N on the surface, as a function of the force's position. A cube is not
 rotationally symmetric, but its influence functions are sums of circular components (circular.py).
 With the distance r and direction phi from the force to the cube, and the force's components F_r
-along this direction, F_t across it and F_z along the normal, each pad stress v is::
+along this direction, F_t across it and F_z along the normal, the stress v of a pad is::
 
     v = sum_m Re(w c),   c = exp(i m phi) (R(r) F_r + Z(r) F_z + i T(r) F_t)
 
 A Fourier series over phi gives the functions R, Z and T of every pad and order m. The functions of
 all pads are combinations, with complex weights w, of a few circular components of each order, found
-by singular value decomposition. The spectra of these components as functions of the wave number k
-(spectra.py) are Hankel transforms::
+by singular value decomposition. The spectra P, M and N of these components as functions of the wave
+number k (spectra.py) are Hankel transforms, with the Bessel functions J::
 
     P = 2 pi int (R + T) J_{m-1}(kr) r dr,   M = 2 pi int (R - T) J_{m+1}(kr) r dr,
     N = 2 pi int Z J_m(kr) r dr
@@ -158,10 +158,10 @@ def _decompose(influence: Influence) -> dict[str, Array]:
     abscissae, weights = np.polynomial.legendre.leggauss(_N_DISTANCES)
     half_reach = influence.reach / 2
     r = (abscissae + 1) * half_reach
-    area = r * weights * half_reach  # r dr
+    area = r * weights * half_reach  # r dr of the integrals over r
 
     # The functions of the distance r are weighted with sqrt(r dr). The square of a singular value
-    # is then an integral over the plane in which the force is moved.
+    # is then an integral of squared stresses over the plane in which the force is moved.
     root = np.sqrt(area)
     series = _compute_fourier_series(influence, r) * root
     flat = series.reshape(*series.shape[:2], -1)

@@ -13,11 +13,11 @@ nearest to it. The matrices of a window are computed once, so that every scan (s
 cubes) needs only one product. Windows of the same kind (same relative poses and noise) share their
 matrices.
 
-The standard deviation of the prior adapts to the data: all prior variances are those with the
-pressure `AMPLITUDE`, multiplied by a scale s^2. The noise matrix B (pad_noise.py) turns the errors
-of all pads into errors of the values. If each pad's error has the variance v, in units of the
-variance of its noise, the variances of the traction increase by (G B)^2 v, with the squares of all
-entries of G B. With n values, the scale is::
+The standard deviation of the prior adapts to the data: the prior variances for the standard
+deviation `AMPLITUDE` of the pressure are multiplied by a factor s^2. The noise matrix B
+(pad_noise.py) turns the errors of all pads into errors of the values. If each pad's error has the
+variance v, in units of the variance of its noise, the variances of the traction increase by
+(G B)^2 v, with the squares of all entries of G B. With n values, the factor is::
 
     s^2 = (y' P y - diag(B' P B) v) / n
 
@@ -77,8 +77,8 @@ class _WindowMatrices(NamedTuple):
             each point: the traction along x, y and z, and the pressure at the cubes' depth.
         variance: Posterior variances (kinds, q, 2) in Pa^2 of the pressure on the surface and of
             that at the cubes' depth, at the scale s = 1 and without errors of the pads.
-        by_pad: Variances (kinds, q, 2, W P) in Pa^2 of these pressures by the noise of each pad,
-            the squares of G B.
+        by_pad: Variances (kinds, q, 2, W P) in Pa^2 of these pressures due to the noise of each
+            pad: the squares of G B.
         precision: Matrices P (kinds, inner C, inner C) of the values of the inner cubes, in 1/Pa^2.
         trace: Diagonals of B' P B (kinds, 1, inner P), by which the noise of each pad of the inner
             cubes reduces s^2.
@@ -129,14 +129,15 @@ class WindowPosteriors:
         place, angle = unroll(poses, np.arange(len(self.near)), self.near)
         first = self._find_kinds(by_pad, variant, place, angle)
 
-        # The matrices are computed for the first window of each kind, and serve for all of them.
+        # Windows (each a cube and those nearest to it) of one kind have equal poses, noise and
+        # calibrations. Their matrices are computed only once, for the first window of the kind.
         cubes = self.near[first]
         windows = (place[first], angle[first], by_pad[cubes], variant[cubes])
 
         def solve_kinds() -> dict[str, Single]:
             solved: dict[str, Single] = {}
             # The matrices of a kind are copied into the result as soon as they are computed,
-            # because a list of all of them would double the memory.
+            # because a list of the matrices of all kinds would double the memory.
             for number, window in enumerate(zip(*windows, strict=True)):
                 for name, array in _solve_window(prior, columns, points, *window).items():
                     if not number:
@@ -154,7 +155,7 @@ class WindowPosteriors:
         place: Array,
         angle: Array,
     ) -> Index:
-        """Set the kind of each window: windows with equal poses, noise and calibrations are alike.
+        """Set the kind of each window, equal for windows with equal poses, noise and calibrations.
 
         Args:
             by_pad: Noise matrices (cubes, C, P).
@@ -216,7 +217,8 @@ class WindowPosteriors:
         return result.reshape(len(near), *shape[1:])
 
     def compute_scale(self, y: Array, pad_variance: Array, known: Mask) -> Array:
-        """Compute the factor s^2 of the prior variances in each window from its inner cubes.
+        """Compute the factor s^2 of the prior variances (head of this file) in each window, from
+        its inner cubes.
 
         Args:
             y: Values (cubes, C) in Pa.
@@ -290,7 +292,8 @@ def _solve_window(
     )
     factor = cholesky(covariance)
 
-    # `cross` is K_ty. Its axes are first the cubes, points, components and results.
+    # `cross` is K_ty. Its axes, at first cubes, points, components and results, become points,
+    # results, and the components of all cubes.
     offset = place[:, None] - points
     cross = prior.compute_surface_covariance(
         offset.reshape(-1, 2),

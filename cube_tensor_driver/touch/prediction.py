@@ -4,8 +4,8 @@
 
 A window (a cube and its nearest neighbours) has the gain matrix G from values to traction and the
 inverse covariance P of the values (posterior.py). Both are computed once, for complete values.
-Let D be the missing and R the other values of the window. Predicting the missing values and then
-using all values gives the same traction as leaving the missing values out::
+With the missing values y_D and the other values y_R of the window, predicting the missing values
+and then using all values gives the same traction as leaving the missing values out::
 
     y_D = -P_DD^-1 P_DR y_R,   the covariance of the traction grows by G_D P_DD^-1 G_D'
 
@@ -44,7 +44,8 @@ class CubePrediction:
         self._cube = cube
         self._near = windows.inner[cube]
         self._columns = np.flatnonzero(missing[cube])
-        # The windows that contain the cube, and its place in the list of cubes of each of them.
+        # The numbers of the windows (each a cube and those nearest to it) that contain this cube,
+        # and its position in the list of cubes of each of these windows.
         self._rows, self._place = np.nonzero(windows.near == cube)
         precision = windows.matrices.precision[windows.kind[cube]].astype(float)
         is_missing = missing[self._near].ravel()
@@ -66,12 +67,13 @@ class CubePrediction:
         scale: Array,
         pad_variance: Array,
     ) -> None:
-        """Add the variance that the error of the prediction causes in the pressures.
+        """Add the variance of the pressures that errors of the predicted values cause.
 
         Args:
             variance: Variances (cubes, q, 2) in Pa^2 of the pressure on the surface and at the
                 cubes' depth, at q points around each cube; they are increased.
-            scale: Factors s^2 (cubes,) of the prior variances in each window.
+            scale: Factors s^2 (cubes,) of the prior variances in the window around each cube, as
+                from `WindowPosteriors.compute_scale`.
             pad_variance: Variances v (cubes, P) of the errors of the pads, divided by the variance
                 of their noise.
         """

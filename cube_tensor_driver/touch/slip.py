@@ -11,6 +11,10 @@ parameters::
 
     dp = (J' J + P)^-1 J' dy
 
+The matrix (J' J + P)^-1 J' contains the derivatives of force and position by the values. To
+linearise a contact means to compute them. This is repeated when the contact has moved or its force
+has changed by more than a limit.
+
 A body that sticks keeps its place on the skin, also while the skin deforms and while the rim of the
 contact slips (Cattaneo, Mindlin). When all of the contact slips (gross slip), Coulomb's law fixes
 the ratio of shear and normal force, and the contact moves along the shear force that the body
@@ -20,14 +24,15 @@ too, but in proportion to the change of the ratio. A body that rolls moves witho
 along its path.
 
 While only the rim of the contact slips (partial slip), the shear force is distributed differently,
-so that the values y of the cubes are not proportional to it. A least-squares fit, with the change n
-of the normal force and the change q of the shear force, shows this by its last term::
+so that the values y of the cubes are not proportional to it. A least-squares fit of y0, a, B and C,
+with the change f of the normal force and the change q (3) of the shear force since the start of the
+fit, shows this by its last term::
 
-    y = y0 + a n + B q + C |q| q
+    y = y0 + a f + B q + C |q| q
 
 For a ball, |C |q| q| / |B q + C |q| q| is about 0.1 at 60 % of the largest shear force that
 friction holds, and 0.2 at the largest one. For a flat punch, which has no partial slip, it is 0.
-The linear terms take up errors of gains and elastomer.
+Errors of the pads' gains and of the elastomer's properties appear in the linear terms.
 
 Source: K. L. Johnson, Contact Mechanics (1985), 7.1 (sliding) and 7.2 (partial slip).
 """
@@ -66,7 +71,8 @@ LAGS = np.array([2, 4, 8, 16, 32, 64])
 early; the long ones find slow slip, whose motion the noise hides over a short time."""
 
 N_SCANS = int(LAGS[-1]) + 1
-"""Number of scans whose motion states are stored: the newest one and those before it for `LAGS`."""
+"""Number of scans whose motion states (position and forces of each contact) are stored: the newest
+scan and those before it, as many as the longest of the `LAGS`."""
 
 MIN_DISTANCE_M = 10e-6
 """Smallest motion in m that counts as slip; the noise of the position is 0.3 to 3 um for loads of
@@ -82,17 +88,18 @@ exceeds it once in 47 s. For slip, the direction must also agree, and `MIN_DISTA
 exceeded: contacts that were held and shaken with 2 g gave no false alarm in 40 minutes."""
 
 LEVER_M = 0.1
-"""Largest height in m above the surface at which an external shear force on a sticking body acts.
-The force tilts the body, which shifts the centre of pressure by the height times the ratio q of
-shear and normal force. Such a shift must not count as slip.
+"""Largest height, in m above the surface, at which an external shear force is assumed to act on a
+sticking body. The force tilts the body, which shifts the centre of pressure by the height times the
+ratio r of shear and normal force. Such a shift must not count as slip.
 
-The assumed height is `LEVER_M` / (1 + 2 q). It is smaller for larger ratios, because a body that is
+The assumed height is `LEVER_M` / (1 + 2 r). It is smaller for larger ratios, because a body that is
 pulled far above the surface tips over before the ratio gets large.
 """
 
 LEAK_M = 0.01
-"""Motion in m that is attributed to a change of the force ratio, or of the logarithm of the normal
-force, by 1. Where the skin deviates from the model, changes of the force look like motion."""
+"""Apparent motion, in m, for a change by 1 of the ratio of shear and normal force, or of the
+logarithm of the normal force. Where the skin deviates from the model, changes of the force look
+like motion, which must not count as slip."""
 
 MIN_RATIO = 0.1
 """Smallest ratio of shear and normal force of a contact that slips. With less shear, the direction
@@ -105,7 +112,7 @@ is rarely less than half of the static one."""
 
 MAX_RATIO_CHANGE = 0.2
 """Largest change of the ratio of shear and normal force, divided by the ratio, during a motion that
-counts as slip. With a larger change, it may be the motion of a sticking body that tilts."""
+counts as slip. A motion with a larger change may be that of a sticking body that tilts."""
 
 MIN_COSINE = 0.8
 """Smallest cosine of the angle between motion and shear force of a contact that slips. A body that
@@ -125,46 +132,52 @@ of the cubes' values since the last fit of the contact tracker. It was 1.6 % (rm
 24-pad cubes, for contacts that had moved by up to some millimetres since this fit."""
 
 MAX_SHIFT_DEPTHS = 0.2
-"""Shift of a contact from where it was linearised, divided by the depth of the cubes' centres below
-the surface, after which it is linearised again: the derivatives of the cubes' values by its force
-and position are computed again."""
+"""Shift of a contact, divided by the depth of the cubes' centres below the surface, after which the
+contact is linearised again: the derivatives of its force and position by the cubes' values are
+computed for its new position."""
 
 MIN_SHIFT_DEPTHS = 0.1
 """Shift of a contact since the last fit of the contact tracker, divided by the depth of the cubes'
-centres, up to which the derivatives need not be exact, because only this small shift is computed
-with them. `MAX_FITTED_SHIFT_DEPTHS` then replaces `MAX_SHIFT_DEPTHS`."""
+centres, up to which the derivatives of its position by the cubes' values need not be exact, because
+only this small shift is computed with them. `MAX_FITTED_SHIFT_DEPTHS` then replaces
+`MAX_SHIFT_DEPTHS`."""
 
 MAX_FITTED_SHIFT_DEPTHS = 0.5
-"""Value that replaces `MAX_SHIFT_DEPTHS` (shift after which the derivatives of the cubes' values
-are computed again) while a contact has moved by at most `MIN_SHIFT_DEPTHS` since its last fit by
-the contact tracker."""
+"""Shift of a contact, divided by the depth of the cubes' centres, after which the derivatives of
+its force and position by the cubes' values are computed again, if the contact has moved by at most
+`MIN_SHIFT_DEPTHS` since its last fit by the contact tracker. Otherwise, `MAX_SHIFT_DEPTHS` is the
+limit."""
 
 MAX_FORCE_CHANGE = 0.3
-"""Change of the force of a contact, divided by the force, after which the derivatives of the cubes'
-values by its force and position are computed again. They depend on the radius of the contact, which
-changes with the force."""
+"""Change of the force of a contact, divided by the force, after which the derivatives of its force
+and position by the cubes' values are computed again. The derivatives depend on the radius of the
+contact, which changes with the force."""
 
 MAX_JUMP = 0.6
-"""Change of the force of a contact since it was linearised, divided by the force, above which its
-motion is unknown. Because of `MAX_FORCE_CHANGE`, only a sudden change, as of a body that bounces,
-exceeds this limit. Linear extrapolation then gives no useful position."""
+"""Change of the force of a contact since the derivatives of its force and position by the cubes'
+values were computed, divided by the force, above which its motion is unknown, because linear
+extrapolation gives no useful position. Only a sudden change, as of a body that bounces, exceeds
+this limit: after slower changes, the derivatives are computed again earlier (`MAX_FORCE_CHANGE`).
+"""
 
 MAX_LINEARISATIONS = 2
-"""Largest number of contacts that are linearised in one scan. Each takes up to 1 ms."""
+"""Largest number of contacts for which the derivatives of force and position by the cubes' values
+are computed in one scan. Each contact takes up to 1 ms."""
 
 NEIGHBOUR_PITCHES = 3.0
 """Distance of two contacts, divided by the pitch (distance of neighbouring cubes), below which
 changes of the cubes' values are attributed to changes of both contacts."""
 
 MAX_NORMAL_CHANGE = 0.05
-"""Change of the normal force of a contact, divided by the force, after which the fit of
-`Slip.partial` starts again. The fit includes a term for the normal force, so that changes of 2 %
-did not change the result."""
+"""Change of the normal force of a contact, divided by the whole force, after which the fit of
+`Slip.partial` (measure of partial slip) starts again. The fit includes a term for the normal force,
+so that changes of 2 % did not change the result."""
 
 MAX_SHIFT_M = 2e-4
-"""Motion of a contact in m after which the fit of `Slip.partial` starts again. Motion changes the
-stresses like partial slip, by as much if it is 1 mm. A motion of 0.1 mm gave values up to 0.05 in
-simulations of flat punches, which have no partial slip."""
+"""Motion of a contact, in m, after which the fit of `Slip.partial` (measure of partial slip) starts
+again. Motion changes the stresses like partial slip; a motion of 1 mm changes them by as much. In
+simulations of flat punches, which have no partial slip, a motion of 0.1 mm gave a `Slip.partial` of
+up to 0.05."""
 
 PARTIAL_DEVIATION = 0.01
 """Largest standard deviation of `Slip.partial`, a ratio that measures partial slip, due to the
@@ -172,22 +185,24 @@ noise of the pads. While it is larger, because the shear force has changed littl
 unknown (NaN)."""
 
 _NEWEST = 0
-"""Index on the second axis of arrays of `_Contacts`: the newest derivatives of a contact's load by
-the values of the cubes."""
+"""Index, on the second axis of arrays of `_Contacts`, of the newest linearisation: derivatives of a
+contact's load (force and position) by the values of the cubes."""
 
 _FIRST = 1
-"""Index on the second axis of arrays of `_Contacts`: the derivatives of a contact's load by the
-values of the cubes with which the fit of `Slip.partial` has begun."""
+"""Index, on the second axis of arrays of `_Contacts`, of the linearisation (derivatives of a
+contact's load by the values of the cubes) that was the newest one when the present fit of
+`Slip.partial` began."""
 
 _SHEAR_TERMS = np.repeat([[0, 0, 1, 1], [0, 0, 0, 1]], [1, 1, 3, 3], axis=1)
-"""Masks (2, 8) of the terms 1, n, q and |q| q: those of the shear force, and the last one."""
+"""Masks (2, 8) of the terms 1, f, q and |q| q of the fit of `Slip.partial` (head of this file): of
+both terms with the shear force, q and |q| q, and of |q| q alone."""
 
 
 Fits = Mapping[int, HertzFit]
 """Fits of one Hertz contact each, by the ids of the contacts (`ContactTracker.single_fits`)."""
 
 NO_FITS: Fits = MappingProxyType({})
-"""Fits if none are known."""
+"""Empty mapping: no contact has a fit of its own in this scan."""
 
 
 class Slip(NamedTuple):
@@ -202,9 +217,10 @@ class Slip(NamedTuple):
         velocity: Velocity (n, 3) of slip in m/s, in the skin's parent frame; 0 without slip, NaN if
             the state is unknown.
         partial: Measure (n,) of partial slip. It is the ratio |C |q| q| / |B q + C |q| q| (head of
-            this file): of the change of the cubes' values that the shear force causes, the part
-            that is not proportional to the change q of the shear force. NaN if the normal force
-            changes, the contact moves, or the shear force has changed too little.
+            this file): the part of the change of the cubes' values that is not proportional to the
+            change q of the shear force, divided by the whole change that the shear force causes.
+            NaN if the normal force changes, the contact moves, or the shear force has changed too
+            little.
     """
 
     state: Index
@@ -232,30 +248,30 @@ class _Contacts:
 
     V values of the cubes near a contact determine its load (2, 3): force in N and position in m.
     The second axis (2) of `cubes`, `weights`, `values` and `pad_variance` stands for two
-    linearisations (derivatives of the load by the values): the newest one (`_NEWEST`), and that
-    with which the fit of `Slip.partial` has begun (`_FIRST`). The latter is used for the whole fit,
-    because other weights would give another shear force even for the same values.
+    linearisations (derivatives of the load by the values): the newest one (`_NEWEST`), and the one
+    that was the newest when the fit of `Slip.partial` began (`_FIRST`). The latter is used for the
+    whole fit, because other derivatives would give another shear force even for the same values.
 
     Attributes:
         normal: Unit normals (n, 3) out of the skin.
         ratio_deviation: Standard deviations s (n,) of the ratio of shear and normal force.
-        largest_ratio: Largest values (n,) so far of this ratio minus 3 s.
+        largest_ratio: Largest value (n,) so far of the ratio of shear and normal force minus 3 s.
         slips: Whether each contact slips (n,).
-        is_fitted: Whether `sums` contain ratios of loads that the tracker has found (n,).
+        is_fitted: Whether the ratios in `sums` are of loads that the tracker has found (n,).
         sums: Sums (n, 3) of 1 / s, 1 / s^2 and ratio / s^2 over the scans in which a contact slips.
         cubes: Indices (n, 2, cubes) of the nearest cubes.
         weights: Derivatives (n, 2, 6, V) of the load by the values in Pa.
         values: Values (n, 2, V) in Pa from which changes are counted.
-        pad_variance: Variances (n, 2) of the noise of all V values together in Pa^2.
+        pad_variance: Sums (n, 2) of the variances of the noise of the V values, in Pa^2.
         noise: Standard deviations (n,) of the position in m; 0 before the first linearisation.
         load: Loads (n, 2, 3) at the newest `values`.
         linearised: Loads (n, 2, 3) for which the newest `weights` were computed.
         past: Motion states (n, scans, 7) of the last scans, from `_compute_motion_states`.
-        terms: Terms (n, 8) of the fit of `Slip.partial` in the newest scan: 1, n, q and |q| q, with
-            the changes n of the normal force and q of the shear force (head of this file).
+        terms: Terms (n, 8) of the fit of `Slip.partial` in the newest scan: 1, f, q and |q| q, with
+            the changes f of the normal force and q of the shear force (head of this file).
         equations: Normal equations (n, 8, 8 + V) of this fit: sums over its scans of the products
             of the terms with the terms and with the changes of the values.
-        partial: Results (n,) of this fit.
+        partial: Results (n,) of this fit, as in `Slip.partial`.
     """
 
     normal: Array
@@ -309,7 +325,7 @@ class _Contacts:
         return _Contacts(*(np.concatenate(pair)[numbers] for pair in pairs))
 
     def describe(self, found: Sequence[TrackedContact]) -> None:
-        """Take over normals and force ratios of the contacts, and compute `partial`."""
+        """Take over normals and ratios of shear and normal force, and compute `partial`."""
         for row, one in enumerate(found):
             ratio = one.shear_force / one.normal_force
             by_normal_force = ratio * one.force_uncertainty
@@ -324,20 +340,20 @@ class _Contacts:
 
         Args:
             found: The contacts.
-            followed: Their loads in the same scan by the changes of the cubes' values.
+            followed: Their loads in the same scan, computed from changes of the cubes' values.
         """
         loads = np.array([(one.force, one.position) for one in found])
         self.load = loads.copy()
         # The tracker has fitted the loads again, which corrects the errors that `followed` has
-        # gathered since the last fit. The past states get the same correction, so that it does not
-        # look like motion.
+        # gathered since the last fit. The past states get the same correction, so that the
+        # correction does not look like motion.
         both = np.stack([followed, loads])
         before, after = _compute_motion_states(both, self.normal)
         self.past += (after - before)[:, None]
 
-        # The friction coefficient is a mean of force ratios during slip. When the tracker fits a
-        # contact for the first time while it slips, earlier ratios are dropped, because they were
-        # only computed from changes of the values.
+        # The friction coefficient is a mean of ratios of shear and normal force during slip. When
+        # the tracker fits a contact for the first time while it slips, earlier ratios are dropped,
+        # because they were only computed from changes of the values.
         slips = self.slips
         if slips.any():
             self.sums[slips & ~self.is_fitted] = 0.0
@@ -350,7 +366,7 @@ class _Contacts:
         return loads
 
     def add_ratios(self, chosen: Mask, ratio: Array, deviation: Array) -> None:
-        """Add force ratios of slipping contacts to the weighted mean that is the friction.
+        """Add force ratios of slipping contacts to the weighted mean, the friction coefficient.
 
         The pads' gains cause the same error in all ratios. So the deviation of the mean is the mean
         of the deviations s, with the same weights 1 / s^2.
@@ -383,7 +399,8 @@ class _Contacts:
         force = _compute_lengths(self.load[:, 0])
         is_over = np.abs(outward[:, 0]) > MAX_NORMAL_CHANGE * force
         is_over |= _compute_lengths(load_change[:, 1]) > MAX_SHIFT_M
-        # Before the first linearisation, the weights and so the shear forces of all scans are 0.
+        # Before the first linearisation, the derivatives of the loads and so the shear forces of
+        # all scans are 0. The fit only begins after this linearisation.
         has_no_shear = self.equations[:, 2, 2] + shear[:, 0] ** 2 == 0
         is_over |= self.slips | has_no_shear
         linear = self.cubes, self.weights, self.values, self.pad_variance
@@ -396,14 +413,16 @@ class _Contacts:
                 self.equations[row] += terms[row, :, None] * factors[row]
 
     def estimate_partial_slip(self) -> Array:
-        """Return `Slip.partial` (n,) by the least-squares fit at the head of this file."""
+        """Return the measure (n,) of partial slip, `Slip.partial`, from the least-squares fit of
+        the cubes' values (head of this file)."""
         partial = np.full(len(self.terms), np.nan)
-        # Eight coefficients need as many scans. A contact that moves begins again in every scan.
+        # The fit of 8 coefficients needs at least 8 scans, whose number is the first diagonal
+        # element of the normal equations. While a contact moves, the fit starts again in each scan.
         rows = np.flatnonzero(self.equations[:, 0, 0] >= 8)
         if len(rows):
             gram, moments = np.split(self.equations[rows], [8], axis=2)
-            # The shear force has no component along the normal. A small addition to the diagonal
-            # lets the matrix be inverted nevertheless.
+            # The matrix is singular, because the shear force has no component along the normal. A
+            # small addition to the diagonal makes it invertible.
             size = np.trace(gram, axis1=1, axis2=2)[:, None, None]
             inverse = np.linalg.inv(gram + 1e-9 * (size + 1) * np.eye(8))
             terms = self.terms[rows, None] * _SHEAR_TERMS
@@ -429,7 +448,7 @@ class _Contacts:
                 normal force (`_compute_motion_states`).
             duration: Durations (lags,) of the lags in s.
             shear_ratio: Shear forces (n, 3) in this scan, divided by the normal forces.
-            ratio: Their lengths (n,).
+            ratio: Lengths (n,) of `shear_ratio`.
 
         Returns:
             Whether each contact has moved (n, lags), and whether it has slipped (n, lags).
@@ -440,19 +459,22 @@ class _Contacts:
         if not moves.any():
             return moves, moves
 
+        # `tilt` is the largest motion of a sticking body that tilts (`LEVER_M`); it is proportional
+        # to the growth of the force ratio along the motion. `leak` is apparent motion (`LEAK_M`).
         ratio = ratio[:, None]
         growth = np.einsum("nlk,nlk->nl", moved, turned) / np.maximum(distance, 1e-12)
         lever = LEVER_M / (1 + 2 * ratio)
         tilt = lever * np.maximum(growth, 0)
         leak = LEAK_M * _compute_lengths(motion[..., 3:])
-        # A force that changes and returns within a long lag shows no change over it, but may have
-        # left the contact shifted. So each lag is allowed the largest shift of all shorter ones.
+        # A force that changes and returns within a long lag shows no change over this lag, but may
+        # have left the contact shifted. So the motion that the force explains over a lag is at
+        # least that over each shorter lag.
         explained = np.maximum.accumulate(tilt + leak, axis=1)
         noise = SIGNIFICANCE * np.sqrt(2) * self.noise[:, None]
         moves = distance > np.maximum(noise, MIN_DISTANCE_M) + explained
         moves &= distance > MIN_SPEED * duration
-        # A lag is twice the one before. The motion over the lag before is therefore the motion in
-        # the second half of a lag; if it is small, the contact has stopped.
+        # Each lag is twice the next shorter one. The motion over the shorter lag is therefore that
+        # in the second half of the longer lag; if it is small, the contact has stopped.
         moves[:, 1:] &= distance[:, :-1] > MIN_LATE_SHARE * distance[:, 1:]
 
         along = np.einsum("nlk,nk->nl", moved, shear_ratio)
@@ -506,7 +528,8 @@ class SlipEstimator:
             values: Components (cubes, 15) in Pa and Pa/m, NaN where unknown.
             found: Contacts that the tracker has found in these values. None: it has not looked for
                 them in this scan, and the contacts are the same as in the previous call.
-            fits: Fits in this scan, whose derivatives need not be computed again.
+            fits: Fits of this scan, which contain the derivatives of force and position by the
+                values, so that they need not be computed again.
 
         Returns:
             Whether a contact has begun to slip.
@@ -602,7 +625,7 @@ class SlipEstimator:
 
         Args:
             loads: Force in N and position in m (n, 2, 3) of the contacts. The position of a contact
-                that is lost is replaced.
+                that has changed suddenly is replaced by that of its last linearisation.
         """
         contacts = self._contacts
         depth = self._inverse.depth
@@ -636,7 +659,7 @@ class SlipEstimator:
         scaled: Array,
         fits: Fits,
     ) -> None:
-        """Compute the weights from changes of the cubes' values to changes of one contact's load.
+        """Compute the derivatives of one contact's load by the values of the cubes nearest to it.
 
         Args:
             row: Number of the contact.
@@ -658,12 +681,13 @@ class SlipEstimator:
         apart = _compute_lengths(positions - place)
         is_near = apart < NEIGHBOUR_PITCHES * inverse.pitch
         near = np.argsort(apart)[: is_near.sum()]
-        # The tracker has just computed the derivatives for this contact alone.
+        # A fit by the tracker in this scan already contains the derivatives. They are used if they
+        # hold for the same home cube and no other contact is near.
         fit = fits.get(self._found[row].id)
         if fit is None or fit.values.home != home or len(near) > 1:
-            # Derivatives are computed in the frame of `home`, the cube nearest to the contact.
-            # Contacts near this one take part. They are sorted by distance, so that this one comes
-            # first.
+            # Derivatives are computed in the frame of `home`, the cube nearest to the contact. The
+            # linearised fit consists of this contact and those near it, sorted by distance:
+            # `compute_weights` gives the derivatives for the first contact, which is this one.
             usable = np.where(is_turned_away[:, None], np.nan, scaled)
             self._noise.update(usable, cubes)
             local = LocalValues(inverse, self._noise, home, cubes)
@@ -699,7 +723,8 @@ def _compute_lengths(vectors: Array) -> Array:
 
 
 def _split_force(force: Array, normal: Array) -> tuple[Array, Array]:
-    """Split forces (..., n, 3) into their components (..., n, 1) along normals (n, 3) and shear."""
+    """Split forces (..., n, 3) into their components (..., n, 1) along the normals (n, 3) and their
+    shear forces (..., n, 3)."""
     outward = (force * normal).sum(axis=-1, keepdims=True)
     return outward, force - outward * normal
 

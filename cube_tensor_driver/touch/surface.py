@@ -183,10 +183,10 @@ class Surface:
         return Field(-self._zz.interpolate(values).ravel(), np.stack(shear, axis=1))
 
     def compute_uncertainty(self, values: Array) -> Array:
-        """Compute the standard deviation (M,) of the interpolated pressure at each point.
+        """Compute the relative standard deviation (M,) of the interpolated pressure at each point.
 
-        It is divided by the standard deviation of the pressure over the skin: 0 at a cube with a
-        value, 1 far from all cubes. Arguments as in `field`.
+        The standard deviation is divided by that of the pressure over the skin: the result is 0 at
+        a cube with a value and 1 far from all cubes. Arguments as in `field`.
         """
         return self._zz.compute_uncertainty(values).ravel()
 
@@ -208,9 +208,9 @@ class Surface:
         each single cube gives the correct position, and a sum over cubes also does if pressure and
         shear have the same weights.
 
-        The stress that spreads beyond the edge of the skin is not measured. The pressure loses
-        little by this, the shear force a fraction of about 1.5 times the ratio of the depth to the
-        distance from the edge.
+        The stress that spreads beyond the edge of the skin is not measured. This reduces the normal
+        force only a little, but the shear force by a fraction of about 1.5 times the ratio of the
+        depth to the distance from the edge.
 
         Args:
             values: Components (cubes, 15) as in `field`.
@@ -279,7 +279,7 @@ class Surface:
     ) -> Contact:
         """Compute force, position and uncertainty of a contact.
 
-        A patch is a square grid of points above one cube; the patches of all cubes cover the skin.
+        A patch is a square grid of points around one cube; the patches of all cubes cover the skin.
 
         Args:
             chosen: Whether the patch of each cube (cubes,) is one of the n patches of the contact.
@@ -287,7 +287,7 @@ class Surface:
             moment_pressure: Pressure (n, points) in Pa, interpolated from values alone, as the
                 shear is.
             shear: Shear stress (n, points, 3) in Pa, in the skin's parent frame.
-            uncertainty: Relative standard deviation (n, points) of the pressure, 0 to 1.
+            uncertainty: Standard deviation (n, points) of the pressure as a fraction of it, 0 to 1.
         """
         points = self._patches[chosen]
         weight = moment_pressure * self.area

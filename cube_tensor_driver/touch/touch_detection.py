@@ -43,8 +43,9 @@ FALSE_ALARMS = 1.0
 
 MIN_RATE_HZ = 1000.0
 """Smallest sampling rate of each cube, in Hz, for which the limit of the CUSUM is computed. Lower
-rates get the limit for this rate, which makes false alarms rarer than chosen. So do recordings,
-which do not state their rate: they give the same touches as a sensor of up to this rate."""
+rates get the limit for this rate, which makes false alarms rarer than chosen. Recordings do not
+state their rate. They get this limit, too, and so give the same touches as a sensor of up to this
+rate."""
 
 TIME_CONSTANT_S = 1.0
 """Time constant, in s, of the high-pass that removes slow drift from the pressure of a cube. The
@@ -52,8 +53,8 @@ high-pass also removes loads that grow slowly, by less than about 2.3 Pa/s on a 
 """
 
 REFERENCE = 2.0
-"""Reference value of the CUSUM, in standard deviations of the noise. It is half of the smallest
-change of the pressure that is to be found in two scans (samples of every cube)."""
+"""Reference value of the CUSUM, in standard deviations of the noise: half of the smallest change of
+the pressure that is to be found in two scans (samples of every cube)."""
 
 OVERSHOOT = 1.04
 """Correction of the limit of the CUSUM, in standard deviations of the noise. It is subtracted from
@@ -62,9 +63,9 @@ the limit that holds for a continuous sum, because a sum of samples jumps beyond
 has chosen (`touch_false_alarms`)."""
 
 SETTLING_ROWS = 10
-"""Number of first samples of a cube whose mean is the start of the slowly drifting part of its
-pressure, which is subtracted. Touch is only looked for after them. At first, the error of this mean
-adds 5 % to the standard deviation of the remaining pressure."""
+"""Number of first samples of a cube, in which touch is not looked for. The slow part of the
+pressure (the average that follows slow drift and is subtracted) starts as their mean. At first, the
+error of this mean adds 5 % to the standard deviation of the remaining pressure."""
 
 NEIGHBOURS = 9
 """Number of cubes that decide together where a touch is, and from which its force is estimated: the
@@ -72,17 +73,19 @@ cube of the touch and those nearest to it."""
 
 SPREAD = 0.25
 """Largest ratio of the pressures that a distant load causes at two neighbouring cubes: the pressure
-of the farther cube divided by that of the nearer one. This ratio limits the pressure that a load
-can cause at other cubes. A touch at such a cube must exceed this limit."""
+of the farther cube divided by that of the nearer one. An upper limit of the pressure that a load
+can cause at other cubes follows from it. A touch there must have a larger pressure."""
 
 MAX_DISTANT_RATIO = 1e-4
-"""Upper limit of the pressure that a load causes at a cube at least seven pitches away, divided by
-the largest pressure of all touched cubes. A touch at such a cube must exceed this limit. The value
-holds for a pitch of 8 mm, a depth of 5 mm, and a shear force of half the normal force."""
+"""Largest pressure that a load can cause at a cube at least seven pitches (distances of
+neighbouring cubes) away, divided by the largest pressure of all touched cubes. A touch there must
+have a larger pressure. The value holds for a pitch of 8 mm, cubes 5 mm below the surface, and a
+shear force of half the normal force."""
 
 MAX_DRIFT = 0.5
-"""Largest drift of the pressure, in Pa/s, at which the rate of false alarms holds. All pads of a
-cube must drift together, by 1.3e-6 of their frequency per second, to cause it."""
+"""Largest drift of the pressure, in Pa/s, at which false alarms are not more frequent than chosen.
+The pressure drifts this fast if all pads of a cube drift together, by 1.3e-6 of their frequency per
+second."""
 
 REMAINDER = 0.02
 """Largest fraction of the pressure under a load that a cube still measures just after the load has
@@ -91,8 +94,8 @@ gone, because the foam of the pads creeps."""
 RESTART_MARGIN = 4.0
 """Pressure, in standard deviations of the noise, that does not count as touch after a cube's slow
 part has started again under a load. The slow part is the average that follows slow drift and is
-subtracted from the pressure. At first, it is a mean of few samples, and its error looks like a
-small touch."""
+subtracted from the pressure. At first, the slow part is a mean of few samples, whose error looks
+like a small touch."""
 
 OTHER_LOADS = 1.0
 """Factor f in the error f F (pitch / distance)^3 that another load with the force F causes in an
@@ -230,8 +233,8 @@ class Touch:
         self._errors = np.zeros((0, NEIGHBOURS, len(COMPONENTS), 0))
         self._errors_cube = np.zeros(0, np.intp)
         self._errors_ns = 0
-        # `_slow` is the slow part of each value (NaN where unknown), `_change` the difference of
-        # the value from it.
+        # `_slow` is the slow part of each value, the average that follows slow drift (NaN where
+        # unknown); `_change` is the newest value minus its slow part.
         self._slow = np.full(variance.shape, np.nan)
         self._change = np.zeros(variance.shape)
         self._left_out = np.zeros(n, np.uint32)
@@ -326,11 +329,12 @@ class Touch:
         return self._locate(int(rows.stamp_ns.min()))
 
     def _restart(self, cubes: Index) -> None:
-        """Let slow parts (averages that follow slow drift) of cubes restart at the next samples."""
+        """Let slow parts (averages that follow slow drift) of cubes start again at their next
+        samples."""
         self._slow[cubes] = np.nan
         self._count[cubes] = 0
-        # While a slow part is held, it is not averaged over more samples. After the restart, it
-        # therefore contains the noise of two samples: the one before and the one after it.
+        # A slow part that is held because of a load is not averaged over more samples. After the
+        # restart, it contains the noise of two samples: the one before and the one after it.
         margin = RESTART_MARGIN * self._deviation[cubes]
         self._margin[cubes] += self._held[cubes] * margin
 
@@ -381,7 +385,8 @@ class Touch:
         Args:
             cube: Indices (k,) of the cubes; `slice(None)` if these are all cubes.
             pressure: Pressures (k,) without their slow part, in Pa, NaN where unknown.
-            elapsed_s: Time (k,) since the row before, in s, up to `TIME_CONSTANT_S`.
+            elapsed_s: Time (k,) since the previous sample of each cube, in s; at most
+                `TIME_CONSTANT_S`.
         """
         margin = self._margin[cube]
         if self._held.any() or margin.any():
@@ -394,8 +399,8 @@ class Touch:
             margin = np.where(self._held[cube], growing, fading)
             self._margin[cube] = margin
 
-        # The slow part of a pressure that drifts steadily lags behind by one time constant. The
-        # largest difference that drift causes is subtracted.
+        # The slow part of a pressure that drifts steadily lags behind the pressure by one time
+        # constant. The difference of the two at the largest drift is subtracted.
         lag = MAX_DRIFT * TIME_CONSTANT_S
         score = (pressure - margin - lag) / self._deviation[cube]
         before = self._sum[cube]
@@ -429,8 +434,9 @@ class Touch:
         largest = strength[self._near].argmax(axis=0)
         top = self._near[largest, self._every_cube]
         is_largest = self._touched & (top == self._every_cube)
-        # In each scan, the upper limit of the pressure spreads to the neighbours of a cube. This is
-        # fast enough: slow parts change little in the scans until the limit has reached all cubes.
+        # In each scan, the upper limit of the pressure that touches cause (`_reach`) spreads from
+        # each cube to its neighbours only. This is fast enough: slow parts change little in the
+        # scans until the limit has reached all cubes.
         spread = SPREAD * self._reach[self._near].max(axis=0)
         felt = np.maximum(spread, MAX_DISTANT_RATIO * strength.max())
         self._reach = np.maximum(strength, spread)
@@ -488,10 +494,10 @@ class Touch:
         return np.array(numbers, np.intp)
 
     def _update_errors(self, cube: Index, stamp_ns: int) -> Array:
-        """Return the errors (m, W, 15, K) of the values of m cubes and their neighbours.
+        """Return the errors (m, W, 15, K) of the 15 values of the W cubes around each of m cubes.
 
-        The errors have K independent causes other than noise. They are only computed if the cubes
-        are not those of the last call, or if they are older than `ERRORS_PERIOD_NS`.
+        The errors have K independent causes other than noise. They are computed again if the cubes
+        are not those of the last call, or if the errors are older than `ERRORS_PERIOD_NS`.
 
         Args:
             cube: Indices (m,) of the cubes.
@@ -520,8 +526,9 @@ class Touch:
 
         Args:
             cube: Indices (m,) of the cubes.
-            share: Fraction (m, 1) of the force that drift and earlier loads may have caused.
-            errors: Errors (m, W, 15, K) of the values, as from `_update_errors`.
+            share: Fraction (m, 1) of each force that may be due to drift and earlier loads.
+            errors: Errors (m, W, 15, K) of the 15 values of the W cubes around each cube by K
+                causes, as from `_update_errors`.
         """
         estimate = self._estimate
         if estimate is None:

@@ -3,10 +3,10 @@
 """Linear estimate of the force of one small load from the cube below it and that cube's neighbours.
 
 The values y of these cubes are the sum of three parts: the response H(x) F to the force F of the
-load at the unknown position x, the responses to other loads farther away, and noise with the
-covariance N. The prior standard deviations of the forces are s for the load and t for other loads.
-<> is the mean over all positions x. The estimate y W of the force F has the smallest mean squared
-error with the matrix::
+load at the unknown position x, the responses (H_other) to other loads farther away, and noise with
+the covariance N. The prior standard deviations of the forces are s for the load and t for other
+loads. <> is the mean over all positions of the load, or of the other loads. The estimate y W of the
+force F has the smallest mean squared error with the matrix::
 
     W = (s^2 <H H'> + t^2 <H_other H_other'> + N)^-1 s^2 <H>
 
@@ -34,17 +34,18 @@ estimate is linear, and wider contacts are sums of such contacts."""
 
 FORCE_DEVIATION = 0.1
 """Standard deviation s, in N, of the Gaussian prior of each component of the force of the load, a
-typical force of a touch. A smaller one would reduce the error due to noise, and increase the error
-due to the unknown position of the load."""
+typical force of a touch. A smaller value would reduce the error due to noise, and increase the
+error due to the unknown position of the load."""
 
 OTHER_FORCE_DEVIATION = 0.03
 """Prior standard deviation t, in N, of each component of the forces of other loads, which are
-farther away than the load whose force is estimated. If it were larger, other loads would change the
-estimate less, but noise and the unknown position would change it more."""
+farther away than the load whose force is estimated. With a larger value, other loads would change
+the estimate less, but noise and the unknown position would change the estimate more."""
 
 MAX_PITCHES = 1.0
-"""Largest distance of the load from the cube along x and along y, in pitches (distances of
-neighbouring cubes). Half a pitch would be enough for small loads; wide ones reach farther."""
+"""Largest distance, along x and along y, at which the estimate assumes the load from the cube, in
+pitches (distances of neighbouring cubes). Half a pitch would be enough for small loads; wide loads
+reach farther."""
 
 MIN_OTHER_PITCHES = 2.0
 """Smallest distance at which the estimate assumes other loads, from the cube below the load whose
@@ -53,13 +54,13 @@ the larger one counts."""
 
 
 class ForceEstimate(NamedTuple):
-    """Matrices that estimate the force of a load from the 15 components of n neighbouring cubes.
+    """Matrices that estimate the force of a load from the 15 components of k neighbouring cubes.
 
     Cubes whose neighbours have the same relative poses and noise are of one kind.
 
     Attributes:
         kind: Number (cubes,) of the kind of each cube.
-        weights: Matrix W (kinds, n 15, 3) from the components, in Pa and Pa/m, to the force on the
+        weights: Matrix W (kinds, k 15, 3) from the components, in Pa and Pa/m, to the force on the
             skin along x, y and z of the cube in the middle, in N.
         noise_variance: Variances (kinds, 3) of the force due to the noise of the pads, in N^2.
         squared_error: Mean squared error (kinds, 3, 3) of each component of the estimate (last axis
@@ -85,7 +86,7 @@ def estimate_forces(
     Args:
         poses: Poses of the cubes.
         elastomer: Layer of elastomer around the cubes.
-        near: Indices (cubes, W) of each cube and its neighbours, the cube itself first.
+        near: Indices (cubes, k) of each cube and its neighbours, the cube itself first.
         covariance: Covariances (cubes, 15, 15) of the noise of the components, in Pa and Pa/m, NaN
             where a component is not observed.
 
@@ -138,10 +139,11 @@ def _solve(
     """Return weights, noise variance and squared error (`ForceEstimate`) for one kind of cube.
 
     Args:
-        signal: Components (W, 15, S, 3) of W cubes for a force of 1 N at each of S positions.
+        signal: Components (k, 15, S, 3) of k cubes for a force of 1 N along x, y and z at each of S
+            positions.
         n_own: Number of positions at which the load may be. They come first; the other positions
             are those of other loads.
-        covariance: Covariances (W, 15, 15) of the noise, NaN where a component is not observed.
+        covariance: Covariances (k, 15, 15) of the noise, NaN where a component is not observed.
     """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     observed = np.isfinite(variance)
@@ -166,10 +168,11 @@ def _solve(
 
 
 def _compute_mean_square(signal: Array) -> Array:
-    """Return the mean <H H'> (n, n) of responses H over S positions of the load.
+    """Return the mean <H H'> (n, n) of products of responses H (n, 3) over S positions of the load.
 
     Args:
-        signal: Components (n, S, 3) for a force of 1 N along x, y and z at each position.
+        signal: Responses (n, S, 3): n components for a force of 1 N along x, y and z at each
+            position.
     """
     flat = signal.reshape(len(signal), -1)
     n_positions = signal.shape[1]

@@ -25,8 +25,8 @@ largest pressure of a wide contact may be far from it."""
 
 MIN_CHANGE_PITCHES = 0.5
 """Distance, in pitches (distances of neighbouring cubes), by which another touch must be nearer to
-a contact than the touch to which it is linked, before the link changes. Otherwise, the link of a
-contact between two touches could change in every scan (set of values of all cubes)."""
+a contact than the linked touch, before the link changes. Otherwise, the link of a contact between
+two touches could change in every scan (set of values of all cubes)."""
 
 
 class TouchLinks:
