@@ -183,7 +183,7 @@ class WindowPosteriors:
         )
 
         # Kinds with only one window come first, so that `multiply` can handle all of them in one
-        # batch. It goes through the other kinds one by one.
+        # batch. The other kinds are handled one by one.
         order = np.argsort(count > 1, kind="stable")
         self.kind = np.argsort(order)[kind.reshape(n)]
         first = first[order]

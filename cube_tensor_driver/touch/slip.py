@@ -84,8 +84,9 @@ MIN_SPEED = 1e-3
 SIGNIFICANCE = 5.0
 """Smallest motion that counts as slip, divided by the standard deviation that the noise of the pads
 causes. With Gaussian noise, 1000 scans a second and 6 lags (`LAGS`), the noise of one contact
-exceeds it once in 47 s. For slip, the direction must also agree, and `MIN_DISTANCE_M` must be
-exceeded: contacts that were held and shaken with 2 g gave no false alarm in 40 minutes."""
+exceeds this limit once in 47 s. A motion that counts as slip must also have the direction of the
+shear force and exceed `MIN_DISTANCE_M`: contacts that were held and shaken with 2 g gave no false
+alarm in 40 minutes."""
 
 LEVER_M = 0.1
 """Largest height, in m above the surface, at which an external shear force is assumed to act on a
@@ -128,8 +129,9 @@ state is `UNKNOWN` unless slip is detected."""
 
 FOLLOWED_DEVIATION = 0.02
 """Relative standard deviation of the ratio of shear and normal force that is computed from changes
-of the cubes' values since the last fit of the contact tracker. It was 1.6 % (rms) in simulations of
-24-pad cubes, for contacts that had moved by up to some millimetres since this fit."""
+of the cubes' values since the last fit of the contact tracker. The error was 1.6 % (rms) in
+simulations of 24-pad cubes, for contacts that had moved by up to some millimetres since this fit.
+"""
 
 MAX_SHIFT_DEPTHS = 0.2
 """Shift of a contact, divided by the depth of the cubes' centres below the surface, after which the

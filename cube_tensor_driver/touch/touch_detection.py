@@ -59,8 +59,8 @@ the pressure that is to be found in two scans (samples of every cube)."""
 OVERSHOOT = 1.04
 """Correction of the limit of the CUSUM, in standard deviations of the noise. It is subtracted from
 the limit that holds for a continuous sum, because a sum of samples jumps beyond the limit. With
-`REFERENCE` = 2, the mean time between false alarms then is 1.05 to 1.15 times the one that the user
-has chosen (`touch_false_alarms`)."""
+`REFERENCE` = 2, the mean time between false alarms then is 1.05 to 1.15 times the time that the
+user has chosen (`touch_false_alarms`)."""
 
 SETTLING_ROWS = 10
 """Number of first samples of a cube, in which touch is not looked for. The slow part of the
@@ -471,7 +471,8 @@ class Touch:
 
         Each touched cube belongs to the touch that is reached by going repeatedly to the neighbour
         with the largest pressure. The number of this touch is stored for the cube. In the next
-        scan, a touch at this cube takes the stored number, so it keeps its number when it moves.
+        scan, a touch at this cube takes the stored number, so that a touch that moves keeps its
+        number.
 
         Args:
             cube: Indices (m,) of the cubes of the touches, the one with the largest pressure first.
