@@ -11,10 +11,10 @@
 enum { N = 0, C = 1, P = 2, G = 3, D = 4, T = 5, K = 7, M = 9, R, V, O, J }; /* index of each letter in CUBE_SCAN_LETTERS */
 enum { STEP, MIN_DISTANCE, FIRST_LOG, LOG_STEP, STRESSES };    /* numbers in `scale` */
 enum { WIDTH = CUBE_CONTACT_LANES, BLOCK = CUBE_CONTACT_BLOCK, SETS = 8 };
-enum { REAL, IMAGINARY, ORDER };                   /* rows of `gather` */
+enum { REAL, IMAGINARY, ORDER };                   /* rows of the array that `gather` fills */
 enum { VALUE, BY_DISTANCE, BY_LOG, BY_LOG_TWICE }; /* derivatives in `differentiate` */
 
-/* Of touch/tracker/hertz_response.py. */
+/* The same constant as in touch/tracker/hertz_response.py. */
 static const float FLATNESS_STEP = 0.2f;
 
 /* `_CUBIC_LAGRANGE` of mechanics/distance_table.py, times 6: coefficients of 1, t, t^2, t^3 in the weights
@@ -26,16 +26,17 @@ static const double CUBIC_LAGRANGE[3][4][4] = {
 
 /* Offset of a cube from a contact, and the force of the contact. */
 typedef struct {
-    double distance, decay;                      /* `decay` is the factor of the tabulated values */
+    double distance, decay;                      /* `decay`: factor of the last values, beyond the table */
     int64_t row, size_row;                       /* table entries below the distance and the radius */
-    double fraction, size_fraction;              /* parts of a row from there to the distance and the radius */
+    double fraction, size_fraction;              /* distance and radius from there, in steps of the table */
     float cosine, sine;                          /* of the direction from the contact to the cube */
     float radial, tangential, normal;            /* force along this direction, across it, and along z */
-    float phase[2][CUBE_CONTACT_ORDERS];         /* of each order, for the direction in the cube's frame */
+    float phase[2][CUBE_CONTACT_ORDERS];         /* exp(i m phi) of order m; phi: direction in the cube's frame */
 } offset;
 
-/* Finds the offset of a cube from contact j, with all lengths divided by `factor`. Smaller distances than
- * `min_distance` take its table entries. Numbers that are not finite get table entries that exist. */
+/* Finds the offset of a cube from contact j, with all lengths divided by `factor`. A distance below
+ * `min_distance` gets the table entries of `min_distance`. Numbers that are not finite get table entries
+ * that exist. */
 INLINE offset find_offset(
     const cube_contact_call *call, int64_t cube, int64_t j, double factor, double min_distance) {
     const double x = (call->place[2 * cube] - call->centre[2 * j]) / factor;
@@ -70,7 +71,7 @@ INLINE offset find_offset(
     return o;
 }
 
-/* Gathers the phases of 16 circular components, and their orders. */
+/* Collects the phases exp(i m phi) of 16 circular components, and their orders m. */
 INLINE void gather(const offset *o, const int64_t *order, float (*restrict phase)[WIDTH]) {
     for (int k = 0; k < WIDTH; k++) {
         phase[REAL][k] = o->phase[REAL][order[k]];
@@ -79,7 +80,8 @@ INLINE void gather(const offset *o, const int64_t *order, float (*restrict phase
     }
 }
 
-/* Rotates 16 of n circular components into the frame of the cube, and adds their effect to the outputs. */
+/* Rotates 16 of n circular components into the frame of the cube, and adds what they contribute to the
+ * outputs (measured components). */
 INLINE void measure(
     float (*phase)[WIDTH], const float *real, const float *imaginary, const float *matrix, int64_t n,
     float *restrict out) {
@@ -96,8 +98,9 @@ INLINE void measure(
     memcpy(out, sum, sizeof sum);
 }
 
-/* Adds the outputs under the force, by linear interpolation (`_respond_fast`). A row of the table has
- * `n_functions` radial functions of n components, of which the first three are used. */
+/* Adds the outputs (measured components) under the force of a contact, by linear interpolation, like
+ * `_respond_fast` of mechanics/contact_response.py. A row of the table has `n_functions` radial functions of
+ * n circular components; the first three functions are used. */
 INLINE void respond(
     const cube_contact_call *call, const offset *o, const float *table, int64_t n_functions,
     const int64_t *order, int64_t n, const float *matrix, float *restrict out) {
@@ -124,7 +127,8 @@ INLINE void respond(
     }
 }
 
-/* Computes the weights of four table entries, or their derivatives, at t between the second and third. */
+/* Computes the weights of four table entries in the value at t, or in a derivative by t, times `factor`. The
+ * second entry is at t = 0, the third one at t = 1. */
 INLINE void weigh(double t, int derivative, double factor, float *weight) {
     for (int i = 0; i < 4; i++) {
         const double *c = CUBIC_LAGRANGE[derivative][i];
@@ -132,7 +136,8 @@ INLINE void weigh(double t, int derivative, double factor, float *weight) {
     }
 }
 
-/* Computes eight sets of outputs (`compute_response_slopes`, whose names it uses). */
+/* Computes eight sets of outputs, as `compute_response_slopes` of mechanics/contact_response.py, with the
+ * same names. */
 INLINE void differentiate(
     const cube_contact_call *call, const offset *o, const float *matrix, float (*restrict out)[WIDTH]) {
     const int64_t n = call->length[M], width = 3 * n, across = call->length[D] * width;
@@ -229,7 +234,7 @@ INLINE void fill_columns(const cube_contact_call *call, int64_t cube, double hal
     }
 }
 
-/* Returns whether the lengths of the first arrays and the orders are possible. */
+/* Returns whether lengths and orders of the arrays that both functions use are possible. */
 static bool is_possible(const cube_contact_call *call) {
     const int64_t *length = call->length;
     bool is_known = true;

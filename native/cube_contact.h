@@ -4,11 +4,12 @@
 /* Values of cubes under Hertz contacts on the surface, and their derivatives by the contacts.
  *
  * The readable specification in numpy is mechanics/contact_response.py for the responses and
- * touch/tracker/hertz_response.py for the rest; a test compares both. They add the terms of sums in other
- * orders, so that their results differ by rounding errors.
+ * touch/tracker/hertz_response.py for the rest; a test compares it with this code. C and numpy add the
+ * terms of sums in different orders, so that their results differ by rounding errors.
  *
- * The same bits on every processor, as in cube_scan.h, except that sines, cosines and logarithms are those
- * of the C library. No heap, no system, no state of its own. */
+ * Results have the same bits on every processor, as in cube_scan.h, except that sines, cosines and
+ * logarithms are those of the C library. The functions allocate no memory, make no system calls and keep
+ * no state. */
 #ifndef CUBE_CONTACT_H
 #define CUBE_CONTACT_H
 
@@ -19,11 +20,16 @@
 #define CUBE_CONTACT_ORDERS 9 /* `N_ORDERS` of touch/pad_measurement.py */
 
 /* Arrays of a call: type, name, kind (of numpy), shape, use. `cube_respond` uses the arrays up to
- * `result`, and `cube_linearise` all but `result`. The tables are from `ContactResponse.collect_tables`.
- * Letters of a shape: R radii, D distances, K radial functions, M circular components (a multiple of 16), V
- * variants, N cubes, J contacts, C measured components, G quantities; of the changes by errors of the
- * elastomer, T radial functions and O 16 components or outputs; and P parameters and one column for the
- * values (a multiple of 4). */
+ * `result`, and `cube_linearise` all but `result`. The tables (`scale` to `matrix` and `change` to
+ * `change_matrix`) are from `ContactResponse.collect_tables`.
+ *
+ * Letters of a shape: N cubes, J contacts, C measured components, V variants of the measurement model, R
+ * radii and D distances of the tables, M circular components (mechanics/circular.py; padded to a multiple of
+ * 16), K radial functions of each circular component in `response` (3 for each quantity), and G quantities
+ * that `cube_respond` computes: the values of the cubes, or their changes by each error of the elastomer.
+ * `change` is the table of these changes for `cube_linearise`, with T radial functions. O = 16 is the number
+ * of its circular components and of the outputs (measured components), both padded. P is the number of
+ * parameters, plus one column for the values, padded to a multiple of 4. */
 #define CUBE_CONTACT_ARRAYS(X)                         \
     X(const double, scale, 'f', "5", INPUT)            \
     X(const float, response, 'f', "RDKM", INPUT)       \
@@ -55,14 +61,14 @@ extern const cube_scan_array cube_contact_arrays[CUBE_CONTACT_N_ARRAYS];
 /* Returns a call without arrays. */
 cube_contact_call cube_contact_begin(void);
 
-/* Computes the values of the cubes, summed over the contacts, by linear interpolation. Three radial
- * functions give one quantity. Returns false if the arrays do not fit together. The numbers in `variant`
- * are not checked. */
+/* Computes G quantities of the cubes, such as their values, summed over the contacts, by linear
+ * interpolation in `response`. Three radial functions (R, Z and T in mechanics/circular.py) give one
+ * quantity. Returns false if the arrays do not fit together. The numbers in `variant` are not checked. */
 bool cube_respond(const cube_contact_call *call);
 
-/* Computes the derivatives of the values by the parameters, and then the values, in `columns`, and whitens
- * them (`differentiate` in hertz_response.py, which explains `halfway`). Returns false if the arrays do not
- * fit together. The numbers in `variant` are not checked. */
+/* Computes `columns`, the derivatives of the values by the parameters and then the values, and `white`, the
+ * same columns whitened (`differentiate` in hertz_response.py, which explains `halfway`). Returns false if
+ * the arrays do not fit together. The numbers in `variant` are not checked. */
 bool cube_linearise(const cube_contact_call *call, double halfway);
 
 #endif

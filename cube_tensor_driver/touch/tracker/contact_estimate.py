@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Force, position, moment and area of a contact, with standard deviations.
 
-All are integrals of the traction, or quotients of such integrals. The integrals are sums over the
-grid contacts (small Hertz contacts, grid_fit.py) of a contact, so their variances follow from the
-covariance of the forces of the grid contacts.
+These quantities are integrals of the traction, or follow from such integrals. The integrals are
+sums over the grid contacts (small Hertz contacts, grid_fit.py) of a contact, so their variances
+follow from the covariance of the forces of the grid contacts.
 """
 
 from __future__ import annotations
@@ -118,10 +118,10 @@ def estimate_contact(
 
     Args:
         centre: Position (2,) in m about which the moments are taken.
-        moments: Sums (3, `N_MOMENTS`) of the forces along x, y and z of the grid contacts, times
-            each of `compute_moment_polynomials`.
-        root: Square root R (3, `N_MOMENTS`, k) of their covariance: with its first two axes joined,
-            R R' is the covariance.
+        moments: Sums (3, `N_MOMENTS`) of the forces along x, y and z of the grid contacts, each
+            force multiplied by 1, x, y, x^2, x y or y^2 of its grid contact.
+        root: Square root R (3, `N_MOMENTS`, k) of the covariance of the moments: with the first two
+            axes of R joined, R R' is this covariance.
         size: Radius of a grid contact in m.
     """
     force = moments[:, 0]
@@ -148,7 +148,8 @@ def estimate_contact(
     by_yy = sine**2 * by_larger + cosine**2 * by_smaller
 
     # `slopes` are the derivatives (4, 3, 6) of the position (x, y), the moment and the area by the
-    # moments of the forces along x, y and z, where those by z are multiplied by the normal force.
+    # moments of the forces along x, y and z. All derivatives by moments of forces along z contain a
+    # division by the normal force, which comes last.
     by_x = [-x, 1.0, 0.0, 0.0, 0.0, 0.0]
     by_y = [-y, 0.0, 1.0, 0.0, 0.0, 0.0]
     along, across = by_xx * x + by_xy * y, by_xy * x + by_yy * y

@@ -5,14 +5,14 @@
 In every scan (set of values of all cubes), the linear inverse problem (inverse.py) yields the field
 of the pressure on the whole skin. Its connected regions of large pressure are the regions of
 contact (pressure_regions.py). The traction in each region is then fitted to the values of the cubes
-around it (tracked_region.py): by one Hertz contact for each contact, or by grid contacts (many
-small contacts on a grid, grid_fit.py) with a prior that is zero outside the region. Force,
+around the region (tracked_region.py): by one Hertz contact for each contact, or by grid contacts
+(many small contacts on a grid, grid_fit.py) with a prior that is zero outside the region. Force,
 position, moment and area of each contact follow from this fit.
 
 Fits take a few milliseconds, so the work in a scan is limited, and the remaining work is done in
-the next scans. Once they are fitted, Hertz contacts that move need one Gauss-Newton step per scan,
-and a fit by grid contacts only needs matrix products. A region that has no fit yet is reported with
-the integrals of the field, which are less exact.
+the next scans. After the first fit, Hertz contacts that move need one Gauss-Newton step per scan,
+and a fit by grid contacts only needs matrix products. The contact of a region that has no fit yet
+is reported with the integrals of the field, which are less exact.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ MAX_REGIONS = 32
 MAX_WORK_PER_SCAN = 12.0
 """Largest computing time of one scan (set of values of all cubes), in ms, as estimated by
 `TRACKING_WORK_MS` and `WORK_MS`. The remaining steps of fits are made in the next scans; one step
-is always made. With 11 instead of 12, twenty fingertips took 46 instead of 44 scans."""
+is always made. With 11 instead of 12, the fits of twenty fingertips took 46 instead of 44 scans."""
 
 TRACKING_WORK_MS = 0.25
 """CPU time, in ms for each region and scan, of the computation of the present fit for the newest
@@ -149,8 +149,8 @@ class ContactTracker:
             certain: Pressure (M,), in Pa at the depth of the cubes below each point of the surface,
                 that a new contact must exceed, because errors of the values may cause smaller ones;
                 None: 0.
-            max_work: Computing work in ms (`MAX_WORK_PER_SCAN`). 0: no fit is made or improved.
-                Infinite: all fits are improved as far as possible.
+            max_work: Limit of the computing time in ms (`MAX_WORK_PER_SCAN`). 0: no fit is made or
+                improved. Infinite: all fits are improved as far as possible.
 
         Returns:
             Contacts, the one with the largest normal force first.
@@ -223,8 +223,9 @@ class ContactTracker:
     def _compute_response_to_fits(self) -> Array:
         """Return the response of all cubes to the traction of all fits.
 
-        It consists of the C components of stress and gradient (times d0, half the side of a cube)
-        that the pads determine (cubes, C), in Pa; NaN where the value of a cube is unknown.
+        The response is an array (cubes, C), in Pa, of the C components of stress and gradient
+        (times d0, half the side of a cube) that the pads determine; NaN where the value of a cube
+        is unknown.
         """
         fitted = self._fitted
         all_cubes = np.arange(len(self._scaled))
@@ -322,7 +323,8 @@ class ContactTracker:
             cubes: Indices (n,) of the cubes.
 
         Returns:
-            Two arrays (cubes of the skin, C) in Pa, 0 for all other cubes.
+            Two arrays (cubes of the skin, C) in Pa, of the C components that the pads determine; 0
+            for all other cubes.
         """
         total = np.zeros(self._scaled.shape)
         deviation = np.zeros(self._scaled.shape)
@@ -334,10 +336,15 @@ class ContactTracker:
         return total, deviation
 
     def _respond(self, cubes: Index) -> tuple[Array, Array]:
-        """Return `_sum_responses` of some cubes, after outdated responses are computed again.
+        """Return the present response of some cubes to all regions, and its standard deviation.
+
+        Outdated responses are computed again before `_sum_responses` adds up those of all regions.
 
         Args:
             cubes: Indices (n,) of the cubes.
+
+        Returns:
+            Two arrays as from `_sum_responses`.
         """
         if len(self._regions) > 1:
             update_responses(self._inverse, self._regions, cubes)
@@ -347,7 +354,7 @@ class ContactTracker:
         """Make and improve fits of regions, the most urgent first (`Work`), up to a limit of work.
 
         Args:
-            max_work: As `MAX_WORK_PER_SCAN`.
+            max_work: Limit of the computing time in ms, as for `update`.
         """
         # Among equally urgent regions, the one that has waited longest comes first.
         order = [(region.next_work, -region.waited) for region in self._regions]
@@ -414,8 +421,8 @@ class ContactTracker:
         traction = np.einsum("nba,nb->na", from_home, field.traction[own])
         force = weight @ traction
         force[2] = -normal_force
-        # A shear force shifts the centre of pressure at a depth, by the depth times the ratio of
-        # shear and normal force.
+        # A shear force shifts the centre of pressure at the depth of the cubes from that at the
+        # surface, by the depth times the ratio of shear and normal force.
         moments = pressing @ unroll_points(inverse, region.home, own) - inverse.depth * force[:2]
         area = len(region.points) * inverse.area
         # The errors of the pressure at all points have the same causes, so their deviations (not
@@ -494,7 +501,8 @@ class ContactTracker:
         return positions, rotations
 
     def _number_contacts(self, positions: Array) -> list[int]:
-        """Return the id of each contact: that of the nearest one in the previous scan, or a new id.
+        """Return the id of each contact: that of the nearest contact in the previous scan, or a new
+        id if there is none within `MATCH_PITCHES`.
 
         Args:
             positions: Positions (n, 3) of the contacts in m.
@@ -528,9 +536,10 @@ def _describe_contact(
     """Describe a contact in the skin's parent frame.
 
     Args:
-        number: Its id.
+        number: Id of the contact.
         position: Position (3,) in m.
-        rotation: Rotation (3, 3) from the frame of the estimate, whose z axis is the normal.
+        rotation: Rotation (3, 3) to the parent frame from the frame of the estimate, whose z axis
+            is the normal.
         estimate: Force of the contact, with variances, on the flattened skin.
         is_refined: Value of `TrackedContact.refined`.
     """

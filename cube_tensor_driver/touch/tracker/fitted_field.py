@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Traction on the whole skin: the sum of the fits of all regions of contact and a residual field.
 
-The residual field is the traction that explains what the fits leave of the cubes' values.
+The residual field is the traction that explains the residuals: the cubes' values minus the values
+that the fits predict.
 """
 
 from __future__ import annotations
@@ -26,11 +27,11 @@ _MIN_RINGS = 4
 is distributed over the points of the surface."""
 
 _RINGS_PER_SPACING = 16
-"""Number of rings of point forces per distance of neighbouring points of the surface.
+"""Number of concentric rings of point forces that represent a Hertz contact, divided by the ratio
+of its radius to the distance of neighbouring points of the surface.
 
-A Hertz contact is represented by point forces on concentric rings, and each point force is moved to
-the nearest point of the surface. With this number, the error of the pressure due to the moves is
-below the standard deviation of the pressure.
+Each point force is moved to the nearest point of the surface. With this number, the error of the
+pressure due to these moves is below the standard deviation of the pressure.
 """
 
 
@@ -38,7 +39,7 @@ def add_fits(
     inverse: SurfaceInverse,
     fits: list[HertzFit | GridFit],
 ) -> tuple[TractionField, FieldDeviation]:
-    """Add up the traction of the fits of all regions of contact, and its variances.
+    """Add up the traction of the fits of all regions of contact, and compute its deviations.
 
     The traction of a fit is averaged over the square that each point represents, so that the sum
     over all points times the area of a square is the force.
@@ -73,11 +74,13 @@ def _distribute(
     values: LocalValues,
     contacts: ContactSum,
 ) -> tuple[Index, Array, Array, Array]:
-    """Return the effect of q contacts at the m points of the surface above some cubes.
+    """Return the forces and pressures that q contacts cause at m points of the surface.
+
+    The points are those above the cubes of a fit.
 
     Args:
         inverse: Points and responses of the skin.
-        values: Gives the cubes and their home cube.
+        values: Cubes of the fit, and their home cube.
         contacts: The contacts.
 
     Returns:
@@ -98,8 +101,8 @@ def _distribute(
     tree = cKDTree(place)
     distance, nearest = tree.query(samples, distance_upper_bound=inverse.spacing)
 
-    # Point forces beyond the border of the skin act on no point; cKDTree.query returns an infinite
-    # distance for them.
+    # Point forces on rings represent each contact (`_RINGS_PER_SPACING`). Point forces beyond the
+    # border of the skin are left out; cKDTree.query returns an infinite distance for them.
     contact, sample = np.nonzero(np.isfinite(distance))
     share = np.zeros((n_points, count))
     np.add.at(share, (nearest[contact, sample], contact), weights[sample, 2])

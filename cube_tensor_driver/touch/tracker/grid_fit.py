@@ -22,8 +22,8 @@ K^1/2' B' B K^1/2 gives mean, covariance and evidence for every s.
 The number of grid contacts is limited, so those of a wide region lie far apart. Where such a fit
 finds force, a finer grid is tried, and kept if its evidence is greater.
 
-Depth, thickness and Poisson's ratio of the elastomer have errors, too. To first order, they change
-w by further columns, whose factors have the prior N(0, 1).
+Depth, thickness and Poisson's ratio of the elastomer have errors, too. In units of their standard
+deviations, they have the prior N(0, 1). To first order, each one changes w in proportion.
 
 Source: C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning (2006), 2.2 and
 5.4.1 (evidence).
@@ -61,8 +61,8 @@ depth of the cubes' centres. With 0.6 instead of 0.4, forces of narrow contacts 
 instead of 0.1 %."""
 
 MAX_GRID_CONTACTS = 80
-"""Largest number of grid contacts (small contacts that make up the traction) of a fit, whose time
-grows with its third power. The grid contacts of larger regions lie farther apart."""
+"""Largest number of grid contacts (small contacts that make up the traction) of a fit. The time of
+a fit grows with the third power of their number. In larger regions, they lie farther apart."""
 
 BORDER_REACH_PITCHES = 1.5
 """Distance from a region of contact at the border of the skin, divided by the pitch (distance of
@@ -73,18 +73,20 @@ contact may extend farther."""
 MAX_BORDER_REACH_DEPTHS = 4.0
 """Largest distance from a region of contact at which grid contacts (small contacts that make up the
 traction) are placed beyond the border of the skin, divided by the depth of the cubes' centres.
-Cubes do not feel the force of grid contacts much farther away, which would make the force of the
-contact arbitrary."""
+The cubes' values do not determine the forces of grid contacts much farther away. With such grid
+contacts, the force of the whole contact would be arbitrary."""
 
 SUPPORT_FORCE = 0.2
 """Smallest normal force of a grid contact (one of the small contacts whose sum is the traction)
-around which a finer grid is placed, divided by that of the strongest one. The force includes its
-standard deviation. On planar cubes three depths apart, forces of rods were off by 0.88 % without a
-finer grid, by 0.67 % with 0.1 and by 0.53 % with 0.2."""
+around which a finer grid is placed, divided by the force of the strongest one. Both forces are root
+mean squares of the posterior, which include the standard deviations. On planar cubes three depths
+apart, forces of rods were off by 0.88 % without a finer grid, by 0.67 % with the value 0.1 and by
+0.53 % with 0.2."""
 
 SUPPORT_MARGIN = 1.0
-"""Largest distance of the grid contacts of a finer grid from those with enough force
-(`SUPPORT_FORCE`), divided by the spacing of the coarser grid."""
+"""Largest distance of the grid contacts (small contacts that make up the traction) of a finer grid
+from the nearest grid contact of the coarser grid with a force above `SUPPORT_FORCE`, divided by the
+spacing of the coarser grid."""
 
 MAX_FINER_SPACING = 0.9
 """Largest spacing of a finer grid of grid contacts (small contacts that make up the traction),
@@ -101,15 +103,15 @@ force where the first one found none.
 """
 
 MIN_SCORE_GAIN = 1.0
-"""Smallest decrease of -2 ln(evidence) for which a narrower prior of the traction replaces the
-present one. The evidence is the probability of the values, with the traction integrated over its
-prior."""
+"""Smallest decrease of -2 ln(evidence) for which a narrower prior of the traction, or a finer grid,
+replaces the present one. The evidence is the probability of the values, with the traction
+integrated over its prior."""
 
 _GRID_CONTACT_RADIUS = 0.36
 """Radius of a grid contact (one of the small contacts whose sum is the traction), divided by the
 depth of the cubes' centres: 0.9 times `GRID_STEP`. It is the same where grid contacts lie farther
-apart, because wider ones would blur narrow edges, and because the cubes hardly feel the gaps
-between contacts that are up to a depth apart."""
+apart, because wider ones would blur narrow edges, and because gaps between grid contacts that are
+up to a depth apart hardly change the stress in the cubes."""
 
 _PEAK_WIDTH = 0.5
 """Standard deviation of the Gaussian that smooths the fitted pressure before its peaks are counted,
@@ -127,22 +129,23 @@ _CORRELATION_LENGTHS = np.array([0.2, 0.8, 3.0])
 narrow, medium and wide contacts."""
 
 _VARIANCE_SHARES = np.array([0.4, 0.4, 0.2])
-"""Shares (3,) of the prior variance of the pressure that have the correlation lengths 0.2, 0.8 and
-3 depths (`_CORRELATION_LENGTHS`)."""
+"""Shares (3,) of the prior variance of the pressure: of its parts with the correlation lengths 0.2,
+0.8 and 3 depths (`_CORRELATION_LENGTHS`)."""
 
 _SCALES = AMPLITUDE * np.geomspace(0.01, 100, 41)
-"""Prior standard deviations (41,) of the pressure, in Pa, from which every fit chooses the one with
-the largest evidence (probability of the values)."""
+"""Prior standard deviations s (41,) of the pressure, in Pa, from which every fit chooses the one
+with the largest evidence (probability of the values)."""
 
 _RELATIVE_DEVIATIONS = np.array([SHEAR_RATIO, SHEAR_RATIO, 1.0])
 """Prior standard deviations of the traction along x, y and z, divided by that of the pressure."""
 
 
 RANK_TOLERANCE = 1e-8
-"""Largest error of the diagonal elements of the matrix D' D (`_Decomposition`) when it is replaced
-by a matrix of smaller rank, divided by the largest element. As errors of the pads' gains limit the
-ratio of signal and noise to 1e6, the combinations of forces that are left out have a ratio below
-0.01."""
+"""Largest error of the diagonal elements of the matrix D' D (`_Decomposition`), divided by the
+largest element, when a matrix of smaller rank replaces D' D. The eigenvalues of D' D are
+proportional to the ratio of signal and noise (of variances) of combinations of forces. Errors of
+the pads' gains limit this ratio to 1e6, so the ratios of the combinations left out are below 0.01.
+"""
 
 MIN_SIGNAL_TO_NOISE = 0.01
 """Smallest ratio of prior variance to noise variance with which a combination of the forces of the
@@ -154,8 +157,8 @@ class GridPosterior(NamedTuple):
     """Posterior of the forces of q grid contacts (small contacts whose sum is a region's traction).
 
     The k unknowns are the combinations of forces that the values determine, divided by their prior
-    standard deviations. The noise of the N values has variance 1 here; `GridFit.misfit` multiplies
-    the covariance.
+    standard deviations. All covariances hold for whitened values (N of them) whose noise has
+    variance 1; `GridFit` multiplies them by its misfit.
 
     Attributes:
         response: Whitened response (k, N) to each unknown.
@@ -167,8 +170,8 @@ class GridPosterior(NamedTuple):
         by_errors: Change (k, S - 1) of the product of `response` and the values for one standard
             deviation of each of these errors.
         scale: Scale s of the prior in Pa.
-        ratios: Variances (K,) of the amplitudes of all K eigenvectors (`_Decomposition`), divided
-            by those of the prior.
+        ratios: Posterior variances of the amplitudes of all eigenvectors (`_Decomposition`),
+            divided by their prior variances.
         errors_root: Square root (3 q, S) of the covariance of the forces due to the errors of the
             elastomer, in N.
         occam_term: Part of -2 ln of the evidence that does not depend on the values.
@@ -188,13 +191,14 @@ class GridPosterior(NamedTuple):
 class _Decomposition(NamedTuple):
     """Eigenvalues and eigenvectors from which the posteriors for all scales of the prior follow.
 
-    The forces are combinations of 3 q unknowns with independent priors of variance 1. The design
-    matrix D (N, 3 q) contains the whitened values that each unknown causes. k eigenvalues of D' D
-    are large enough to matter (`RANK_TOLERANCE`).
+    At the scale 1 Pa, the forces are combinations of 3 q unknowns with independent priors of
+    variance 1. The design matrix D (N, 3 q) contains the N whitened values that each unknown
+    causes. Of the eigenvalues of D' D, k are large enough to matter (`RANK_TOLERANCE`). The
+    amplitudes of the eigenvectors are the coefficients of the unknowns in this basis.
 
     Attributes:
-        eigenvalues: The eigenvalues (k,).
-        vectors: Eigenvectors V (3 q, k).
+        eigenvalues: Eigenvalues (k,) of D' D.
+        vectors: Their eigenvectors V (3 q, k).
         design: Matrix D (N, 3 q).
         root: Matrix (3, q, q) from the unknowns to the forces along x, y and z.
         basis: Matrix (3 q, k) from the amplitudes of the eigenvectors to the forces.
@@ -208,18 +212,20 @@ class _Decomposition(NamedTuple):
 
 
 class _Scale(NamedTuple):
-    """Scale s of the prior, and what follows from it (head of this file).
+    """Scale s of the prior (prior standard deviation of the pressure), and what follows from it.
 
-    The S properties of the elastomer are the depth, which comes first, and others, whose errors are
-    estimated.
+    Of the S properties of the elastomer (sensitivity.py), the depth comes first. The errors of the
+    other ones are estimated together with the forces, in units of their standard deviations. The k
+    eigenvectors and their amplitudes are those of `_Decomposition`.
 
     Attributes:
         scale: Scale s in Pa.
-        projected: Products (k, 1 + S) of the response to the eigenvectors and the values, and of
-            this response and the sensitivities of the values to the properties.
-        variances: Variances (k,) of the amplitudes of the eigenvectors.
-        signal_to_noise: Ratio (k,) of prior variance and noise variance of each amplitude.
-        errors: Changes (S - 1, 2) of the estimated errors by the values and by the depth.
+        projected: Products (k, 1 + S) of the whitened values that each eigenvector causes with the
+            measured values (first column), and with their sensitivities to the properties.
+        variances: Posterior variances (k,) of the amplitudes.
+        signal_to_noise: Ratio (k,) of prior variance to noise variance of each amplitude.
+        errors: Estimated errors (S - 1, 2): from the values, and as they would follow if the values
+            were their sensitivities to the depth.
         information: Precision (S - 1, S - 1) of the estimated errors.
         occam_term: Part of -2 ln of the evidence that does not depend on the values.
         score: -2 ln of the evidence, up to a constant.
@@ -280,7 +286,7 @@ class GridFit:
         self.values = values
         self.places = places
         self.spacing = spacing
-        # `_coarsest` is the fit of the whole region if `sharpen` has made this one from it.
+        # `_coarsest` is the fit of the whole region if `sharpen` has made this fit from that one.
         self._coarsest: GridFit | None = None
         self._first_envelope = np.ones(len(places))
         self._finer: GridFit | None = None
@@ -342,14 +348,15 @@ class GridFit:
     def solve(self, white: Array) -> None:
         """Compute the posterior with the prior of the first fit.
 
-        It is equal for all grid contacts, except on a finer grid (`sharpen`).
+        This prior is the same for all grid contacts, except on a finer grid (`sharpen`).
 
         Args:
             white: Values (n C,), C components of stress and gradient of each of n cubes,
                 transformed by `LocalValues.whiten` so that their noise has variance 1.
         """
         whitening = self.values.whitening
-        # Rows of unknown components are 0, so 1 on the diagonal makes the matrices invertible.
+        # In whitening matrices, rows of unknown components are 0. A 1 on the diagonal makes the
+        # matrices invertible.
         is_unknown = ~self.values.known
         invertible = whitening + is_unknown[:, :, None] * np.eye(is_unknown.shape[1])
         self._unwhitening = np.linalg.inv(invertible)
@@ -365,7 +372,7 @@ class GridFit:
 
         This removes force that the first fit spreads over points where nothing touches the skin. If
         the evidence of the new fit is not clearly higher, the present fit is kept, and the next
-        calls try a finer grid where it finds force.
+        call tries a finer grid where the present fit finds force.
 
         Args:
             white: Whitened values (n C,), as for `solve`.
@@ -441,8 +448,8 @@ class GridFit:
 
     @property
     def explained(self) -> Array:
-        """Components (n, C), in Pa, that the forces cause in the cubes around the region; 0 where
-        the component is unknown."""
+        """Components (n, C), in Pa, that the forces and the estimated errors of the elastomer cause
+        in the cubes around the region; 0 where the component is unknown."""
         whitened = self._explained.reshape(*self.values.known.shape, 1)
         return np.asarray((self._unwhitening @ whitened)[:, :, 0])
 
@@ -457,8 +464,8 @@ class GridFit:
         """Return force, centre, moment and area of each contact of the region, by integration."""
         if self._estimates:
             return self._estimates
-        # For second moments, the force of a grid contact counts as spread over an area as wide as
-        # the distance of neighbouring grid contacts.
+        # For the area, the radius of grid contacts counts as proportional to their distance, so
+        # that gaps between grid contacts that lie far apart do not reduce the area.
         radius = _GRID_CONTACT_RADIUS / GRID_STEP * self.spacing
         for centre, polynomials, unit_root in self._contacts:
             root = np.sqrt(self.misfit) * unit_root
@@ -502,8 +509,8 @@ class GridFit:
 
         Args:
             white: Whitened values (n C,).
-            first: Scale of the prior that `_find_scale` returns for `_decomposition`, without the
-                errors or with those of the last fit.
+            first: Result of `_find_scale` for `_decomposition`, either without sensitivities to the
+                elastomer's properties or with those of the last fit.
         """
         decomposition = self._decomposition
         basis = decomposition.basis
@@ -550,7 +557,8 @@ class GridFit:
     def _propagate(self, weights: Array) -> Array:
         """Return a square root (m, n) of the covariance of m weighted sums of the forces.
 
-        It is divided by the square root of the misfit.
+        The covariance is that for a misfit of 1. Otherwise, the result has to be multiplied by the
+        square root of the misfit.
 
         Args:
             weights: Weights (m, 3, q) of the forces along x, y and z.
@@ -558,7 +566,7 @@ class GridFit:
         posterior, decomposition = self.posterior, self._decomposition
         count = len(weights)
         flat = weights.reshape(count, -1)
-        # The values reduce the deviations of the prior along the eigenvectors only.
+        # The values reduce the prior standard deviations only along the eigenvectors.
         by_axis = weights.swapaxes(0, 1) @ decomposition.root
         prior = by_axis.swapaxes(0, 1).reshape(count, -1)
         along = flat @ decomposition.basis
@@ -567,7 +575,8 @@ class GridFit:
 
     @property
     def _normal_covariance(self) -> Array:
-        """Covariance (q, q) of the normal forces, divided by the misfit, in N^2."""
+        """Covariance (q, q), in N^2, of the normal forces of the q grid contacts for a misfit of 1.
+        Otherwise, the covariance has to be multiplied by the misfit."""
         posterior, decomposition = self.posterior, self._decomposition
         root = decomposition.root[2]
         basis, errors_root = decomposition.basis[-len(root) :], posterior.errors_root[-len(root) :]
@@ -575,27 +584,28 @@ class GridFit:
         return np.asarray(posterior.scale**2 * exact + errors_root @ errors_root.T)
 
     def _find_scale(self, decomposition: _Decomposition, columns: Array) -> _Scale:
-        """Find the scale of the prior that has the largest evidence.
+        """Find the scale of the prior (prior standard deviation s of the pressure) that has the
+        largest evidence (probability of the values).
 
         Args:
             decomposition: Result of `_decompose`.
-            columns: Whitened values in the first column, and their sensitivities to S properties of
-                the elastomer, the depth first, in the others (n C, 1 + S). Only the values (n C, 1)
-                if the sensitivities are unknown.
+            columns: Array (n C, 1 + S). The first column contains the whitened values: C components
+                of each of n cubes. The others contain their sensitivities to S properties of the
+                elastomer, the depth first; they are left out if the sensitivities are unknown.
         """
         prior_variances = _SCALES[:, None] ** 2
         projected = decomposition.vectors.T @ (decomposition.design.T @ columns)
 
-        # With X = `columns`, `products` are X' W X for every scale s, with the matrix
-        # W = (1 + s^2 B K B')^-1. By the Woodbury identity, they are X' X minus the part that the
-        # prior of the forces explains.
+        # With X = `columns` and the inverse covariance W = (1 + s^2 B K B')^-1 of the whitened
+        # values (head of this file), `products` are X' W X for every scale s. By the Woodbury
+        # identity, they are X' X minus `explained_by_forces`.
         signal_to_noise = prior_variances * decomposition.eigenvalues
         weights = prior_variances / (1 + signal_to_noise)
         explained_by_forces = (projected.T * weights[:, None]) @ projected
         products = columns.T @ columns - explained_by_forces
 
         # The errors of all properties but the depth are estimated together with the forces. The
-        # depth only adds to the covariance.
+        # error of the depth is not estimated; it only adds to the covariance of the forces.
         information = products[:, 2:, 2:] + np.eye(products[0, 2:].shape[0])
         gradients = products[:, 2:, :2]
         errors = np.linalg.solve(information, gradients)
@@ -655,8 +665,8 @@ class GridFit:
         )
         self._estimates = []
         self._discs = None
-        # Each contact is described by its centre, the polynomials of its grid contacts, and a
-        # square root of the covariance of its moments.
+        # Each contact is described by its centre, the polynomials (1, x, ..., y^2) of its grid
+        # contacts, and a square root of the covariance of its moments for a misfit of 1.
         self._contacts = []
         for label in range(labels.max() + 1):
             own = labels == label

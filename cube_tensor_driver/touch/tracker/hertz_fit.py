@@ -81,9 +81,10 @@ then both directions along x and along y."""
 class Linearisation(NamedTuple):
     """Values of C components of n cubes under J Hertz contacts, and how these values change.
 
-    The parameters are the 8 of each contact (force, centre, logarithm of the radius, flatness,
-    moment), and then the errors of S quantities of the elastomer (sensitivity.py), in standard
-    deviations. Together they are p = 8 J + S.
+    The components are those of stress and gradient that the pads determine. The p = 8 J + S
+    parameters are the 8 of each contact (force, centre, logarithm of the radius, flatness as in
+    `FLATNESS_STEP`, moment), and then the errors of S quantities of the elastomer (sensitivity.py),
+    in standard deviations.
 
     Attributes:
         contacts: The contacts.
@@ -123,8 +124,8 @@ class HertzFit:
     Attributes:
         values: Positions and noise of the cubes.
         found: Parameters (force, centre, radius) of the contacts that the last step has found.
-        misfit: Chi-squared (squared whitened residual and prior terms) divided by the number of
-            known values; at least 1.
+        misfit: Chi-squared (sum of the squares of the whitened residual, and prior terms) divided
+            by the number of known values; at least 1.
         shape_misfit: Mean squared whitened residual of the `SHAPE_CUBES` cubes nearest to the
             contacts. A wrong shape changes it more than contacts elsewhere do.
         last_step: Size of the last Gauss-Newton step, as in `SETTLED_STEP`; infinite before the
@@ -165,7 +166,8 @@ class HertzFit:
         # first scan of a fit there are none.
         self._previous: Discs | None = None
         n_contacts = len(starts.forces)
-        # `_lengths` are the units of the three columns of a step in `SETTLED_STEP`.
+        # `_lengths` are the units in which the size of a step (`SETTLED_STEP`) is measured: of the
+        # changes of x, y and the logarithm of the radius of a contact.
         self._lengths = np.array([depth, depth, 1.0])
         flatness_deviation = 1.0
         moment_deviation = FORCE_DEVIATION * depth
@@ -210,9 +212,9 @@ class HertzFit:
     def is_inexact(self) -> bool:
         """Whether the linearised response of the cubes is not exact for the contacts found.
 
-        It is not if it is that of other cubes, if the `displacement` of the contacts is at least
-        `SETTLED_STEP`, or if the prior precision of the elastomer's errors exceeds
-        `MAX_PRECISION_RATIO` times the misfit.
+        The response is not exact if it was computed for other cubes, if the `displacement` of the
+        contacts is at least `SETTLED_STEP`, or if the prior precision of the elastomer's errors
+        exceeds `MAX_PRECISION_RATIO` times the misfit.
         """
         if self.linear.cubes is not self.values:
             return True
@@ -224,7 +226,7 @@ class HertzFit:
     @property
     def needs_linearisation(self) -> bool:
         """Whether the response of the cubes must be linearised again before the next step, because
-        it is inexact or the noise of the cubes has changed."""
+        the present one is inexact or the noise of the cubes has changed."""
         return self.is_inexact or self.values.is_stale
 
     @property
@@ -274,8 +276,8 @@ class HertzFit:
         """Set the contacts at which the fit of a new scan (set of values of all cubes) begins.
 
         Args:
-            extrapolates: Whether they are extrapolated, by the changes of centres and forces
-                between the last two scans; otherwise they are the contacts of the last scan.
+            extrapolates: Whether these contacts are extrapolated, by the changes of centres and
+                forces between the last two scans; otherwise they are the contacts of the last scan.
         """
         found, previous = self.found, self._previous
         self._previous = found
@@ -341,7 +343,7 @@ class HertzFit:
 
     @property
     def _contact_changes(self) -> Array:
-        """Changes (J, 8) of the parameters of the contacts by the last step."""
+        """Changes (J, 8) by the last step of the 8 parameters of each contact."""
         n_parameters = len(self.contact_precision)
         return self._changes[:n_parameters].reshape(-1, N_PARAMETERS)
 
@@ -394,15 +396,16 @@ class HertzFit:
         """Describe the contacts as a sum of Hertz contacts, with the covariance of their forces.
 
         The fitted contacts are not pure Hertz contacts: flatness moves their pressure to the rim
-        (`FLATNESS_STEP`), and a moment about z acts on them. So each one becomes seven Hertz
-        contacts: itself, one shifted each way along x and along y, one wider and one narrower. A
-        difference of two of them approximates a derivative of its traction, for example by the
-        centre. So a change of any parameter means changes of the seven forces, and the covariance
-        of the parameters gives the covariance of these forces.
+        (`FLATNESS_STEP`), and a moment about z acts on them. So each fitted contact becomes seven
+        Hertz contacts: one with its centre and radius, one shifted each way along x and along y,
+        one wider and one narrower. A difference of two of the seven approximates a derivative of
+        the traction of the fitted contact, for example by its centre. So a change of any parameter
+        means changes of the seven forces, and the covariance of the parameters gives the covariance
+        of these forces.
 
         Args:
-            step: Shift in m. It is at least the spacing of the points at which the traction is
-                evaluated, because contacts shifted by less have the same traction there.
+            step: Shift in m. The shift is at least the spacing of the points at which the traction
+                is evaluated, because contacts shifted by less have the same traction there.
         """
         no_shift = np.zeros((2, 2))
         places = self.found.centres[:, None] + np.concatenate([step * _STENCIL, no_shift])
@@ -420,8 +423,9 @@ class HertzFit:
         patterns[3, 5:] = np.array([1, -1]) / (2 * FLATNESS_STEP)
         patterns[4, 5:] = -wider_share, wider_share - 1
         # `slopes` are the derivatives (J, 8, 3, 7) of the forces of the seven contacts by the eight
-        # parameters. A moment of 1 N m is that of half the derivative by x as forces along y, and
-        # minus half the derivative by y as forces along x.
+        # parameters. Two distributions of force, with half of the moment each, make up a moment of
+        # 1 N m: the derivative by x of a contact with the force 1/2 N along y, and the derivative
+        # by y of a contact with the force -1/2 N along x.
         slopes = np.zeros((len(places), N_PARAMETERS, 3, 7))
         slopes[:, :3] = np.eye(3)[:, :, None] * patterns[0]
         slopes[:, 3:7] = patterns[1:, None] * self.found.forces[:, None, :, None]
@@ -484,8 +488,8 @@ def linearise(inverse: SurfaceInverse, fit: HertzFit) -> None:
 
     Args:
         inverse: Responses (stress in the skin under contacts of unit force).
-        fit: The fit, whose attribute `linear` is set. The steps need values that are whitened with
-            the same noise, so the noise is not refreshed here.
+        fit: The fit, whose attribute `linear` is set. Its noise (`LocalValues`) is not refreshed
+            here, because the values of the next step must be whitened with the same noise.
     """
     contacts, values = fit.found, fit.values
     columns, white = differentiate(

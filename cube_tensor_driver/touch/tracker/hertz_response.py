@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Values of cubes under Hertz contacts, and their derivatives by the contacts, in C or in numpy.
 
-The functions in numpy are the ones to read, and run without a compiler. The ones in C
+The functions in numpy are easier to read, and run without a compiler. The functions in C
 (native/cube_contact.c) add the terms of sums in another order, so that results differ by rounding
 errors.
 """
@@ -32,7 +32,8 @@ N_PARAMETERS = 8
 radius, flatness, and moment about z."""
 
 _BLOCK = 4
-"""Number of parameters whose derivatives the function in C whitens side by side."""
+"""Number of parameters whose derivatives the function in C whitens together. The number of columns
+is rounded up to a multiple of this number."""
 
 
 def respond(
@@ -52,7 +53,8 @@ def respond(
         discs: The contacts.
 
     Returns:
-        The C components (n, C) in Pa (`ContactResponse.compute_response_to_forces`).
+        The C measured components (n, C) in Pa, as from
+        `ContactResponse.compute_response_to_forces`.
     """
     response = inverse.contact_response
     if native is None:
@@ -91,8 +93,8 @@ def respond_to_errors(
         discs: The contacts.
 
     Returns:
-        Changes (n, S, C) in Pa of the C components, for errors of one standard deviation
-        (`ContactResponse.compute_sensitivity`).
+        Changes (n, S, C) in Pa of the C measured components by S quantities of the elastomer, each
+        with an error of one standard deviation (`ContactResponse.compute_sensitivity`).
     """
     response = inverse.contact_response
     if native is None:
@@ -131,15 +133,16 @@ def differentiate(
         whitening: Lower triangular matrices (n, C, C) that whiten the values.
 
     Returns:
-        Derivatives (n, C, p + 1), in Pa, of the values by the p = 8 J + S parameters, which are
-        those of the contacts and the errors of S quantities of the elastomer, in standard
-        deviations. The values are the last column. Then the same array, whitened.
+        Array (n, C, p + 1), in Pa, and the same array, whitened. The first p = 8 J + S columns are
+        the derivatives of the C measured components by the parameters: those of the contacts
+        (`N_PARAMETERS`), then the errors of S quantities of the elastomer, in standard deviations.
+        The last column contains the components themselves.
     """
-    # The response is not linear in the depth. Its change from the stated depth to the one found
-    # follows from the derivative halfway between these two depths. In a half space, this is the
-    # derivative at the stated depth, if the lengths of the load are divided by `halfway`, times a
-    # factor. The factor is left out: as it is the same for all values, it only scales the error of
-    # the depth that the next Gauss-Newton step finds.
+    # The response is not linear in the depth. The change of the response from the stated depth to
+    # the one found follows from the derivative halfway between these two depths. In a half space,
+    # this derivative is a factor times the derivative at the stated depth under a load whose
+    # lengths are divided by `halfway`. The factor is left out: as it is the same for all values, it
+    # only scales the error of the depth that the next Gauss-Newton step finds.
     halfway = 1 + depth_error / 2
     if native is None:
         columns = _differentiate_in_numpy(
@@ -229,8 +232,9 @@ def _differentiate_in_numpy(
         forces,
     )
     # The derivative by the flatness is the response to a contact minus that to a mixture of a wider
-    # and a narrower one (see `FLATNESS_STEP`, h). With the derivatives `first` and `second` by the
-    # logarithm of the radius, it is h^2 (first - second / 2), to order h^2.
+    # and a narrower one (with h = `FLATNESS_STEP`, see there). With the derivatives `first` and
+    # `second` of the response by the logarithm of the radius, this difference is
+    # h^2 (first - second / 2), to order h^2.
     first, second = slopes[:, 5], slopes[:, 6]
     slopes[:, 6] = FLATNESS_STEP**2 * (first - second / 2)
     by_contact = inverse.select(slopes).reshape(

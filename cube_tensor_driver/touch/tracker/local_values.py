@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Values of the cubes around a region, divided by their noise.
 
-The noise of a cube grows with the stress of its pads, because the relative error of their gains is
-`GAIN_ERROR`. Computing the noise takes long, so it is only done for cubes whose stress has changed.
+The noise of a cube grows with the stress on its pads, because their gains have the relative error
+`GAIN_ERROR`. As the computation takes long, the noise is only computed again for cubes whose stress
+has changed.
 """
 
 from __future__ import annotations
@@ -22,23 +23,25 @@ MIN_FACING = 0.5
 responds to a contact above the other. On a bent skin, cubes that face away do not respond."""
 
 MAX_NOISE_CHANGE = 3.0
-"""Factor between the present variance of a pad's error and the one in use, in either direction,
-above which the noise of its cube is computed again."""
+"""Largest ratio of the variance of a pad's error under the present stress to the variance in use,
+or of the latter to the former. Above this ratio, the noise of the pad's cube is computed again. The
+same limit applies to the total disturbance of a fit (`_MIN_DISTURBANCE`)."""
 
 MODEL_ERROR = 1e-4
 """Standard deviation of the error of the stress that the model of the skin predicts on a pad,
 divided by the largest stress on any pad of the surrounding cubes."""
 
 _MIN_DISTURBANCE = 1e-3
-"""Change of the total disturbance, in Pa, that is ignored even if the relative change is large. The
-total disturbance is the sum of the standard deviations of the stress that other contacts cause in
-the cubes of a fit. The limit is far below the noise of a pad and far above rounding errors."""
+"""Largest change of the total disturbance, in Pa, after which a fit keeps the weights of its cubes,
+however large the relative change is. The total disturbance is the sum of the standard deviations of
+the stress that other contacts cause in the cubes of the fit; the larger that of a cube, the smaller
+its weight. The limit is far below the noise of a pad and far above rounding errors."""
 
 
 class CubeNoise:
-    """Noise of all cubes of a skin, which grows with the stress of their pads.
+    """Noise of all cubes of a skin, which grows with the stress on their pads.
 
-    C is the number of components of stress and gradient that some cube determines.
+    C is the number of components of stress and gradient that at least one cube determines.
 
     Attributes:
         whitening: Matrices (cubes, C, C) that transform the values of a cube so that their noise
@@ -66,9 +69,9 @@ class CubeNoise:
         """Compute the noise of cubes again if it has changed.
 
         The noise of a cube has changed if other pads are in use, other components are known (not
-        NaN) or other errors are stated (`SurfaceInverse.state_errors`) than at the last update. It
-        has also changed if its stress makes the variance of a pad's error differ by more than the
-        factor `MAX_NOISE_CHANGE`.
+        NaN) or other errors are stated (`SurfaceInverse.state_errors`) than at the last update. The
+        noise has also changed if the stress of the cube makes the variance of a pad's error differ
+        by more than the factor `MAX_NOISE_CHANGE`.
 
         Args:
             scaled: Components of stress and gradient (times d0, half the side of a cube), in Pa
@@ -92,8 +95,9 @@ class CubeNoise:
         columns = np.where(known, values, 0.0)[:, :, None]
         stresses = (self._to_pads.take(cubes, axis=0) @ columns)[:, :, 0]
 
-        # The predicted stress of a pad is wrong by interpolation errors of the tabulated response
-        # and by contacts that are not found yet. Both grow with the stress in the cubes around.
+        # Interpolation errors of the tabulated response, and contacts that are not found yet, cause
+        # errors of the predicted stress on a pad. Both grow with the stress in the cubes around.
+        # Stresses are in units of the pad's noise without load here, so this noise has variance 1.
         magnitudes = np.abs(stresses)
         self._peak[cubes] = magnitudes.max(axis=1)
         around = inverse.near.take(cubes, axis=0)
@@ -211,7 +215,7 @@ class LocalValues:
         self.count = int(np.count_nonzero(self.known))
         self._total_disturbance = float(self.disturbance.sum())
 
-        # The noise has variance 1 after whitening, to which the disturbance adds its own variance.
+        # The noise has variance 1 after whitening. The disturbance adds its own variance to this 1.
         whitening = noise.whitening.take(cubes, axis=0)
         white_disturbance = (whitening @ self.disturbance[:, :, None])[:, :, 0]
         square = np.einsum("nc,nc->n", white_disturbance, white_disturbance)

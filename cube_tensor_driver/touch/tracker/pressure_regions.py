@@ -32,8 +32,8 @@ MAX_JOINED_CUBES = 12
 stay separate, so that each one is small enough to be fitted."""
 
 VALLEY = 0.8
-"""Threshold of the ratio of the lowest pressure between two peaks to the pressure at the lower
-peak. Below it, the two peaks are two contacts, if the fall is also significant (`MIN_FALL`)."""
+"""Ratio of the lowest pressure between two peaks to the pressure at the lower peak, below which the
+two peaks are two contacts, if the fall of the pressure is also significant (`MIN_FALL`)."""
 
 MIN_FALL = 4.0
 """Smallest fall of the pressure from the lower one of two peaks to the lowest pressure between
@@ -73,8 +73,8 @@ class PressureRegions:
 
         Args:
             pressure: Pressure (M,) in Pa at the depth of the cubes, below all points.
-            certain: Pressure (M,) in Pa that must be exceeded below each point in a new region,
-                because errors of the values may cause smaller pressures; None: 0 at all points.
+            certain: Pressure (M,) in Pa that the pressure below each point of a new region must
+                exceed, because errors of the values may cause smaller ones; None: 0 at all points.
 
         Returns:
             Indices of the points of each region and their largest pressure in Pa, the region with
@@ -99,7 +99,11 @@ class PressureRegions:
         return np.asarray(around[around < len(self._inside)])
 
     def _connect_points(self) -> list[Index]:
-        """Return the indices of the points of each region, without an order of the regions."""
+        """Return the indices of the points of each region, without an order of the regions.
+
+        Regions within `JOIN_PITCHES` of each other are joined, unless they then lie above more than
+        `MAX_JOINED_CUBES` cubes.
+        """
         inside = np.flatnonzero(self._inside)
         wide = self._label(inside, self._wide_neighbours)
         regions = []
@@ -159,7 +163,7 @@ def split_peaks(pressure: Array, covariance: Array, is_neighbour: Mask) -> Index
 
     Args:
         pressure: Pressure (q,) at the grid points, in any unit.
-        covariance: Its covariance (q, q), in the squared unit of the pressure.
+        covariance: Covariance (q, q) of these pressures, in the squared unit of the pressure.
         is_neighbour: Whether two grid points are neighbours (q, q).
 
     Returns:
@@ -174,7 +178,7 @@ def split_peaks(pressure: Array, covariance: Array, is_neighbour: Mask) -> Index
     for point, other in np.argwhere(is_neighbour).tolist():
         neighbours[point].append(other)
     # Grid points are assigned in the order of falling pressure, each one to the peak of its
-    # neighbours. One with neighbours of two peaks is the saddle point between these peaks.
+    # neighbours. A grid point with neighbours of two peaks is the saddle point between these peaks.
     for point in np.argsort(-pressure).tolist():
         around = sorted({owner[other] for other in neighbours[point]} - {-1})
         if not around:

@@ -47,9 +47,9 @@ proportional to the stress.
 """
 
 MAX_OTHERS_CHANGE = 0.3
-"""Change of the stress that other regions cause in the cubes of a fit by grid contacts (small
-contacts on a grid), above which the region is fitted again. It is the mean square of the change
-since the fit, in units of the noise.
+"""Largest mean square change of the stress that other regions cause in the cubes of a fit by grid
+contacts (small contacts on a grid) since this fit, divided by the variance of the noise. After a
+larger change, the region is fitted again.
 
 The first fits of regions that begin together each subtract an inexact estimate of the stress that
 the other regions cause. A narrow prior that was found with this estimate (`GridFit.sharpen`) would
@@ -70,18 +70,18 @@ each, and of 0.2 for planar cubes, whose pads lie in one plane and determine few
 
 MAX_NEAR_MISFIT = 10.0
 """Largest misfit (chi-squared per known value) with which the first Hertz contact of a region is
-kept if other regions are near. It is larger than `MAX_HERTZ_MISFIT`, because contacts of these
-regions may cause it. Larger misfits were seen when a Hertz contact was fitted to a fingertip,
-or one contact to two balls."""
+kept if other regions are near. This limit is larger than `MAX_HERTZ_MISFIT`, because contacts of
+these regions may cause the misfit. Misfits above the limit were seen when a Hertz contact was
+fitted to a fingertip, or one contact to two balls."""
 
 MAX_BAD_SCANS = 5
 """Number of successive scans (sets of values of all cubes) with too large a misfit (chi-squared per
 known value) after which a fit by grid contacts (small contacts on a grid) is tried instead of
 Hertz contacts.
 
-A misfit is too large if it exceeds `MAX_MISFIT_GROWTH` times the one of the first fit. One such
-scan does not suffice, because a new contact nearby also increases the misfit until its pressure is
-large enough to be found.
+A misfit is too large if it exceeds `MAX_MISFIT_GROWTH` times the misfit of the first fit. One such
+scan does not suffice, because a new contact nearby also increases the misfit until the pressure of
+this contact is large enough for it to be found.
 """
 
 MAX_START_SIZE = 2.0
@@ -108,16 +108,18 @@ distance, the cube nearest to the contacts becomes the home cube."""
 MAX_STALE_CHANGE = 0.06
 """Relative change of a region's contacts, divided by the relative standard deviation (`FIT_ERROR`
 or `START_ERROR`) of the stress that they cause in distant cubes, from which on this stress is
-computed again. Until then, it is outdated by much less than its standard deviation.
+computed again. After a smaller change, the stress is wrong by much less than its standard
+deviation.
 
 The relative change is the larger one of two numbers: the shift of a contact divided by the distance
 of the nearest other region, and the change of a force divided by the largest force.
 """
 
 COARSE_DEVIATION = 0.1
-"""Relative standard deviation that is stated for the force of a contact without a fit, and at least
-for that of a fit that is not refined, such as the Hertz contact of a fingertip until its grid
-contacts are fitted. The position gets the same part of the pitch as its deviation.
+"""Relative standard deviation that is added, in quadrature, to the other deviations of the force of
+a contact without a fit, or with a fit that is not refined, such as the Hertz contact of a fingertip
+until its grid contacts are fitted. The same fraction of the pitch (distance of neighbouring cubes)
+is added, likewise, to the standard deviation of the position.
 
 The force without a fit is the integral of the pressure at the depth of the cubes, which the linear
 inverse problem of elasticity yields from the values of all cubes. These integrals were off by 1 to
@@ -147,18 +149,19 @@ its misfit has grown, it makes up to this number of further steps in the same sc
 """
 
 HOPELESS = 4.0
-"""The first fit of a Hertz contact is given up after half of its `MAX_STEPS` steps if its misfit
-(chi-squared per known value) is then at least this multiple of the largest one with which the fit
-is kept."""
+"""Smallest misfit (chi-squared per known value) after half of the `MAX_STEPS` steps with which the
+first fit of a Hertz contact is given up, divided by the largest misfit with which such a fit is
+kept after all steps."""
 
 Respond = Callable[[Index], tuple[Array, Array]]
 """Function that takes the indices of n cubes and returns their response to all regions of contact:
-changes (n, C), in Pa, of their C measured components, and the standard deviations of these changes
-(n, C), in Pa."""
+changes, in Pa, of their C measured components, and the standard deviations of these changes, in Pa.
+Both are arrays (cubes of the skin, C) that are 0 for all other cubes."""
 
 
 class Work(IntEnum):
-    """Next step of the fit of a region of contact. Steps with the smallest number are made first.
+    """Kind of the next step of the fit of a region of contact. Steps with the smallest number are
+    made first.
 
     MOVE makes a Gauss-Newton step of Hertz contacts. BEGIN makes the first fit of a Hertz contact.
     PREPARE places grid contacts (small contacts on a grid); SOLVE fits the traction by them. CHOOSE
@@ -186,10 +189,12 @@ WORK_MS = {
     Work.RENEW: 7.0,
     Work.SHARPEN: 7.5,
 }
-"""Approximate CPU time, in ms, of the steps of a region with `MAX_GRID_CONTACTS` grid contacts. The
-work in a scan is counted with these numbers, not with a clock, so that a recording gives the same
-contacts again. They were measured with 24-pad cubes and the functions in C (hertz_response.py).
-BEGIN took 1.2 ms for a single region and 1.3 to 2.2 ms beside nineteen others.
+"""Approximate CPU time, in ms, of each kind of step of a region's fit; for a fit by grid contacts
+(small contacts on a grid), with `MAX_GRID_CONTACTS` of them. The work in a scan (set of values of
+all cubes) is counted with these numbers, not with a clock, so that a recording gives the same
+contacts again. The times were measured with 24-pad cubes and the functions in C
+(hertz_response.py). BEGIN took 1.2 ms for a single region and 1.3 to 2.2 ms if there were nineteen
+others.
 """
 
 
@@ -209,7 +214,7 @@ class TrackedRegion:
         gap: Distance from the nearest other region in m.
         response: Response (cubes, C), in Pa, of all cubes of the skin to this region.
         integral: Estimate of the contact from integrals of the traction field, used until there is
-            a fit; in the frame of the cube that was `home` when it was computed.
+            a fit. The estimate is in the frame of the cube that was `home` when it was computed.
         waited: Number of scans (sets of values of all cubes) since the fit was last improved.
     """
 
@@ -234,7 +239,8 @@ class TrackedRegion:
         self._fitted_points = self.points
         self._fitted_peak = 0.0
         self._fitted_others: Array
-        # `_others_change` is the sum of squares for `MAX_OTHERS_CHANGE`, for `_compared_others`.
+        # `_others_change` is the sum of squares whose mean `MAX_OTHERS_CHANGE` limits, as computed
+        # when `others` was `_compared_others`.
         self._compared_others: Array | None = None
         self._others_change = 0.0
         self._first_misfit = 1.0
@@ -246,7 +252,8 @@ class TrackedRegion:
         self._steps = 0
         self.integral: ContactEstimate
         self.others: Array
-        # `_checked` are the contacts that `find_stale_cubes` has compared last.
+        # `_checked` are the contacts that `find_stale_cubes` has compared last. `_responded` are
+        # the home cube and the contacts for which `response` was last computed.
         self._checked: Discs | None = None
         self._responded = (
             -1,
@@ -311,7 +318,8 @@ class TrackedRegion:
         """Return force, position, moment and area of each contact of the region.
 
         Args:
-            is_refined: Whether the region `is_refined`.
+            is_refined: Value of the property `is_refined`. If it is false, larger variances are
+                returned (`COARSE_DEVIATION`).
         """
         if self.fit is None:
             return [self.integral]
@@ -347,10 +355,11 @@ class TrackedRegion:
         return self._others_change > MAX_OTHERS_CHANGE * values.count
 
     def _follow_home(self, fit: HertzFit) -> None:
-        """Choose a new home cube if the contacts have moved away from it, or drop the fit.
+        """Choose a new home cube if the contacts have moved away from the present one, or drop the
+        fit.
 
         The home cube is the cube around which the curved skin is laid flat for the fit. The fit is
-        dropped if a contact has left the region, or if its force pulls on the skin.
+        dropped if one of its contacts has left the region or pulls at the surface.
         """
         inverse = self._inverse
         values = fit.values
@@ -387,7 +396,8 @@ class TrackedRegion:
         return LocalValues(self._inverse, self._noise, home, facing)
 
     def _whiten_newest(self, values: LocalValues) -> Array:
-        """Return `_whiten` after an update of the noise and of the response to other regions."""
+        """Return the newest values as from `_whiten`, after updates of the noise of the cubes and
+        of their response to other regions."""
         self._noise.update(self._noise.scaled, values.cubes)
         self.subtract_others(values, *self._respond(values.cubes))
         values.refresh()
@@ -402,9 +412,10 @@ class TrackedRegion:
     def is_refined(self) -> bool:
         """Whether the fits of this region and of all regions near agree with the newest values.
 
-        A fit does not agree if its misfit has grown. The fit of this region does not agree, either,
-        if it must be repeated first. A fit with an equal prior for all grid contacts agrees even if
-        the response to other regions has changed, because it follows the newest response.
+        They do not agree if a region near has no fit, if a misfit has grown, or if the traction in
+        this region must be fitted (again) first. A change of the response to other regions requires
+        that only after `GridFit.sharpen`, which has adapted the prior to the old response. Before,
+        the prior is the same for all grid contacts, and the fit follows the newest response.
         """
         is_worse = any(one._is_misfit_larger for one in (self, *self.near))
         if is_worse or not self.has_fitted_neighbours:
@@ -429,8 +440,8 @@ class TrackedRegion:
     def take_integral(self, integral: ContactEstimate) -> None:
         """Store the estimate from integrals of the field, at which the first fit begins."""
         self.integral = integral
-        # The area of the integral is that of the pressure at the depth of the cubes, where a
-        # squared radius is larger by about the squared depth.
+        # `integral.area` is the area of the pressure at the depth of the cubes. The squared radius
+        # of this area is larger than that at the surface by about the squared depth.
         depth = self._inverse.depth
         squared_radius = integral.area / math.pi - depth**2
         largest = MAX_START_SIZE * depth
@@ -559,7 +570,7 @@ class TrackedRegion:
 
     def step(self) -> None:
         """Compute the fit of this region for the newest values. A `HertzFit` makes a Gauss-Newton
-        step; it is dropped if its contacts pull at the surface after it."""
+        step; the fit is dropped if one of its contacts then pulls at the surface."""
         fit = self.fit
         if fit is None:
             return
@@ -618,8 +629,8 @@ class TrackedRegion:
         Args:
             values: Cubes of the fit. Its attribute `disturbance` is set to the standard deviation
                 of `others`.
-            total: Response (cubes, C), in Pa, of all cubes to all regions, this one included. It
-                need only be set for the cubes of the fit.
+            total: Response (cubes, C), in Pa, of all cubes to all regions, this one included. Only
+                the rows of the cubes of the fit are used.
             deviation: Standard deviation (cubes, C) of this response, in Pa.
         """
         cubes = values.cubes
@@ -684,7 +695,8 @@ class TrackedRegion:
         """Make `fit` the fit of this region, and store the state of the region at this fit.
 
         The state consists of the points of the surface, the largest pressure, the response to other
-        regions and the misfit. If later scans differ from it too much, the region is fitted again.
+        regions and the misfit. If the state of a later scan differs too much, the region is fitted
+        again.
         """
         self.fit = fit
         self._responded = -1, fit.discs
@@ -709,7 +721,7 @@ def iterate(
         inverse: Responses of the skin.
         fit: The fit.
         white: Whitened values (n C,), as for `HertzFit.step`.
-        steps: The number.
+        steps: Largest number of steps.
     """
     for _ in range(steps):
         linearise(inverse, fit)
