@@ -534,6 +534,16 @@ def test_before_its_fit_a_contact_has_the_force_and_place_of_the_pressure_below(
     np.testing.assert_allclose(found.position[:2], centre, atol=0.5e-3)
 
 
+def test_a_palm_is_never_refined(inverse):
+    """Its region has more cubes than are fitted, so that it stays an integral."""
+    values = punch(inverse, 9e-2, np.zeros(2), np.array([0.0, 0.0, -30.0]))
+    tracker = ContactTracker(inverse, LEAST)
+    for _ in range(3):
+        (found,) = tracker.update(values)
+        assert not found.refined
+        assert found.force_uncertainty >= 0.1 * found.normal_force
+
+
 def test_a_contact_whose_fit_pulls_keeps_its_id_with_the_force_of_the_pressure_below(
     inverse, monkeypatch
 ):

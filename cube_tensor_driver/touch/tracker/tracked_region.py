@@ -412,13 +412,13 @@ class TrackedRegion:
     def is_refined(self) -> bool:
         """Whether the fits of this region and of all regions near agree with the newest values.
 
-        They do not agree if a region near has no fit, if a misfit has grown, or if the traction in
+        They do not agree if one of them is missing, if a misfit has grown, or if the traction in
         this region must be fitted (again) first. A change of the response to other regions requires
         that only after `GridFit.sharpen`, which has adapted the prior to the old response. Before,
         the prior is the same for all grid contacts, and the fit follows the newest response.
         """
         is_worse = any(one._is_misfit_larger for one in (self, *self.near))
-        if is_worse or not self.has_fitted_neighbours:
+        if self.fit is None or is_worse or not self.has_fitted_neighbours:
             return False
         return self.next_work in (Work.MOVE, Work.CHOOSE, Work.SHARPEN, Work.NONE)
 
