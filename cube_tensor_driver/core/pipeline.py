@@ -84,9 +84,10 @@ UNKNOWN = np.iinfo(np.uint16).max
 rows) takes numbers of 16 bits. No skin has a cube with this number."""
 
 _calibrations: WeakValueDictionary[str, Calibration] = WeakValueDictionary()
-"""Calibration that all pipelines of the process use, by its id (hash of the content).
+"""Calibrations in use by any pipeline of the process, by their ids (hashes of the content).
 
-If a skin file is read again, its estimators are found in the cache.
+If a skin file is read again, its calibrations are replaced by the equal ones in this dictionary.
+`_find_estimator` has cached the estimators of these.
 """
 
 

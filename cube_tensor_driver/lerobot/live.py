@@ -284,7 +284,10 @@ class RecordedWindows:
 
 
 def read_frame_number(picture: AnyArray) -> int:
-    """Read the frame number (time of reading, in ms since the Unix epoch) from a picture.
+    """Read the frame number that black and white squares in a picture show.
+
+    The number is the time at which the picture was read from the camera, in ms since the Unix
+    epoch.
 
     Args:
         picture: Picture of a skin, (height, width, 3) or (3, height, width).

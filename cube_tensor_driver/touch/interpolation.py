@@ -158,12 +158,15 @@ class Interpolation:
 
 
 def _compute_covariance(a: Array, u: Array, b: Array, v: Array) -> Array:
-    """Compute the covariances of a quantity or its derivatives at n sets of positions (file head).
+    """Compute the covariances of a quantity and its derivatives at n sets of positions.
+
+    The head of this file states the covariance φ of the quantity and the length c. Derivatives are
+    by positions divided by c.
 
     Args:
-        a: Positions (n, A, 3), divided by the length c.
-        u: Directions (n, A, 3) of the derivatives at `a`, which are by position / c; 0 for the
-            quantity itself.
+        a: Positions (n, A, 3), divided by c.
+        u: Directions (n, A, 3) in which the quantity is differentiated at `a`; 0: the quantity
+            itself is meant.
         b: Other positions (n, B, 3), divided by c.
         v: Directions (n, B, 3) of the derivatives at `b`.
 

@@ -92,13 +92,14 @@ class _WindowMatrices(NamedTuple):
 
 
 class WindowPosteriors:
-    """Windows (the cubes nearest to one cube) of all cubes, and the products with their matrices.
+    """Windows (the cubes nearest to one cube) of all cubes, and products of matrices and values.
 
     Attributes:
         near: Indices (cubes, W) of the cubes of each window, sorted by their distance from its
             centre cube, which comes first.
-        inner: Indices (cubes, inner) of the inner cubes of each window, the first of its cubes.
-        kind: Index (cubes,) of the kind of each window.
+        inner: Indices (cubes, inner) of the first `INNER_CUBES` cubes of each window.
+        kind: Number (cubes,) of the kind of each window. Windows of one kind have equal poses,
+            noise and calibrations, and therefore equal matrices.
         matrices: Matrices of the kinds of windows.
         pads: Noise matrices (cubes, C, P) of all cubes in Pa, 0 where nothing is observed.
     """

@@ -134,21 +134,19 @@ simulations of 24-pad cubes, for contacts that had moved by up to some millimetr
 """
 
 MAX_SHIFT_DEPTHS = 0.2
-"""Shift of a contact, divided by the depth of the cubes' centres below the surface, after which the
-contact is linearised again: the derivatives of its force and position by the cubes' values are
-computed for its new position."""
+"""Shift of a contact since it was linearised, divided by the depth of the cubes' centres below the
+surface, after which it is linearised again: the derivatives of its force and position by the cubes'
+values are computed for its new position."""
 
 MIN_SHIFT_DEPTHS = 0.1
-"""Shift of a contact since the last fit of the contact tracker, divided by the depth of the cubes'
-centres, up to which the derivatives of its position by the cubes' values need not be exact, because
-only this small shift is computed with them. `MAX_FITTED_SHIFT_DEPTHS` then replaces
-`MAX_SHIFT_DEPTHS`."""
+"""Smallest shift of a contact since the last fit of the contact tracker, divided by the depth of
+the cubes' centres, for which `MAX_SHIFT_DEPTHS` applies. A smaller shift is computed well enough
+with inexact derivatives, for which `MAX_FITTED_SHIFT_DEPTHS` is the limit."""
 
 MAX_FITTED_SHIFT_DEPTHS = 0.5
-"""Shift of a contact, divided by the depth of the cubes' centres, after which the derivatives of
-its force and position by the cubes' values are computed again, if the contact has moved by at most
-`MIN_SHIFT_DEPTHS` since its last fit by the contact tracker. Otherwise, `MAX_SHIFT_DEPTHS` is the
-limit."""
+"""Shift of a contact since it was linearised, divided by the depth of the cubes' centres, after
+which it is linearised again (`MAX_SHIFT_DEPTHS`) even if the contact tracker has just fitted it, so
+that its position is known."""
 
 MAX_FORCE_CHANGE = 0.3
 """Change of the force of a contact, divided by the force, after which the derivatives of its force
@@ -191,9 +189,9 @@ _NEWEST = 0
 contact's load (force and position) by the values of the cubes."""
 
 _FIRST = 1
-"""Index, on the second axis of arrays of `_Contacts`, of the linearisation (derivatives of a
-contact's load by the values of the cubes) that was the newest one when the present fit of
-`Slip.partial` began."""
+"""Index, on the second axis of arrays of `_Contacts`, of the linearisation for the fit of
+`Slip.partial` (measure of partial slip). This fit needs the same derivatives in all of its scans,
+so those from its first scan are kept."""
 
 _SHEAR_TERMS = np.repeat([[0, 0, 1, 1], [0, 0, 0, 1]], [1, 1, 3, 3], axis=1)
 """Masks (2, 8) of the terms 1, f, q and |q| q of the fit of `Slip.partial` (head of this file): of
@@ -204,7 +202,7 @@ Fits = Mapping[int, HertzFit]
 """Fits of one Hertz contact each, by the ids of the contacts (`ContactTracker.single_fits`)."""
 
 NO_FITS: Fits = MappingProxyType({})
-"""Empty mapping: no contact has a fit of its own in this scan."""
+"""Empty mapping, for scans in which the contact tracker has fitted no contact."""
 
 
 class Slip(NamedTuple):

@@ -1,10 +1,10 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Links contacts to touches.
+"""Links each contact on the skin to the touch that it belongs to.
 
-A touch is detected in every scan (set of values of all cubes), at the cube with the largest
-pressure (touch_detection.py). The contact tracker finds the contacts less often, but with more
-detail (tracker/contact_tracker.py). A link tells which touch a contact belongs to.
+Both describe what presses on the skin. A touch is detected in every scan (set of values of all
+cubes), at the cube with the largest pressure (touch_detection.py). The contact tracker finds
+contacts less often, but with more detail (tracker/contact_tracker.py).
 """
 
 from __future__ import annotations

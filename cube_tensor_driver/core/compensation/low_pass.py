@@ -112,7 +112,7 @@ class LowPass:
         now: Array,
         ahead_s: Real,
     ) -> Array:
-        """Advance the filters by one interval for each cube, and compute the sums.
+        """Advance the filters by one interval for each cube, and compute their weighted sums.
 
         Args:
             elapsed_s: Lengths of the intervals (C,), in s; 0 leaves the lags unchanged.

@@ -44,8 +44,9 @@ cube's rows get the status bit COMPENSATION (the compensation is uncertain). It 
 pressure that counts as a contact (300 Pa)."""
 
 DRIFT = 1e-4
-"""Standard deviation of the drift of oscillators (relative change of their frequency per K) that a
-calibration does not state. It is the usual temperature coefficient of R and C, 100 ppm/K."""
+"""Standard deviation of the drift of oscillators (relative change of their frequency per K), used
+if the calibration does not state the drift. It is the usual temperature coefficient of R and C, 100
+ppm/K."""
 
 MIN_LAG_S = 1e-3
 """Smallest time constant of a low-pass filter, in s. It replaces a shorter one in a calibration,

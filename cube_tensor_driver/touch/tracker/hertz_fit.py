@@ -60,10 +60,13 @@ the errors of the elastomer explain this residual, in place of a shift of the co
 """
 
 MAX_PRECISION_RATIO = 2.0
-"""Largest ratio of the prior precision of the elastomer's errors to the misfit (chi-squared per
-known value). Both should be equal, because the misfit multiplies all variances of a fit, and the
-prior variance of these errors is 1. Above this ratio, the response is linearised again with the
-present misfit as precision."""
+"""Largest ratio of the prior precision of the errors of depth, thickness and Poisson's ratio to the
+misfit (chi-squared per known value). Above it, the response is linearised again with the present
+misfit as precision.
+
+The prior variance of these errors is 1, in units of their standard deviations. The covariance of a
+fit is multiplied by the misfit, so that a precision equal to the misfit restores the variance 1.
+"""
 
 REPEAT_STEP = 0.1
 """Size of a Gauss-Newton step, as in `SETTLED_STEP`, above which the fit makes another step for the

@@ -29,7 +29,7 @@ flatness 0, a rigid flat punch flatness 1.
 
 N_PARAMETERS = 8
 """Number of parameters of a contact: force f_x, f_y, f_z, centre c_x, c_y, logarithm ln a of the
-radius, flatness, and moment about z."""
+radius, flatness (`FLATNESS_STEP`), and moment about z."""
 
 _BLOCK = 4
 """Number of parameters whose derivatives the function in C whitens together. The number of columns

@@ -25,7 +25,8 @@ responds to a contact above the other. On a bent skin, cubes that face away do n
 MAX_NOISE_CHANGE = 3.0
 """Largest ratio of the variance of a pad's error under the present stress to the variance in use,
 or of the latter to the former. Above this ratio, the noise of the pad's cube is computed again. The
-same limit applies to the total disturbance of a fit (`_MIN_DISTURBANCE`)."""
+same limit applies to the error of the stress that other contacts cause in the cubes of a fit
+(`_MIN_DISTURBANCE`)."""
 
 MODEL_ERROR = 1e-4
 """Standard deviation of the error of the stress that the model of the skin predicts on a pad,

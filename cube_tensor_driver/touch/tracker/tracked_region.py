@@ -47,9 +47,9 @@ proportional to the stress.
 """
 
 MAX_OTHERS_CHANGE = 0.3
-"""Largest mean square change of the stress that other regions cause in the cubes of a fit by grid
-contacts (small contacts on a grid) since this fit, divided by the variance of the noise. After a
-larger change, the region is fitted again.
+"""Largest change of the stress from other regions after which a fit by grid contacts (small
+contacts on a grid) stays in use. The change is the mean square over the cubes of the fit, divided
+by the variance of the noise. After a larger change, the region is fitted again.
 
 The first fits of regions that begin together each subtract an inexact estimate of the stress that
 the other regions cause. A narrow prior that was found with this estimate (`GridFit.sharpen`) would
@@ -128,8 +128,8 @@ centres below the surface) apart, and Hertz contacts of fingertips by 9 %.
 """
 
 START_ERROR = 0.15
-"""Relative standard deviation, before a contact is fitted, of the stress that it causes in the
-cubes around other contacts. Their fits subtract this stress and count its error as noise.
+"""Relative standard deviation of the stress that a contact without a fit causes in the cubes around
+other contacts. The fits of these other contacts subtract the stress and count its error as noise.
 
 The stress is inexact, because the force is only an estimate: the integral of the traction that the
 linear inverse problem of elasticity yields from the values of all cubes.
@@ -413,9 +413,10 @@ class TrackedRegion:
         """Whether the fits of this region and of all regions near agree with the newest values.
 
         They do not agree if one of them is missing, if a misfit has grown, or if the traction in
-        this region must be fitted (again) first. A change of the response to other regions requires
-        that only after `GridFit.sharpen`, which has adapted the prior to the old response. Before,
-        the prior is the same for all grid contacts, and the fit follows the newest response.
+        this region must be fitted (again) first. If the response to other regions has changed, a
+        new fit is required only after `GridFit.sharpen`, which has adapted the prior to the old
+        response. Before, the prior is the same for all grid contacts, and the present fit follows
+        the newest response.
         """
         is_worse = any(one._is_misfit_larger for one in (self, *self.near))
         if self.fit is None or is_worse or not self.has_fitted_neighbours:
