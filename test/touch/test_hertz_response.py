@@ -35,8 +35,9 @@ ROUNDING = 1e-6
 """Largest difference of C and numpy in values and their derivatives by forces and errors of the
 elastomer, divided by the largest one."""
 SLOPE_ROUNDING = 2e-4
-"""The same for derivatives by centre, radius, flatness and moment. These are small differences of
-large numbers, so that their rounding errors are larger."""
+"""Largest difference of C and numpy in derivatives by centre, radius, flatness and moment, divided
+by the largest one. These derivatives are small differences of large numbers, so that their rounding
+errors are larger."""
 
 
 def make_points() -> SimpleNamespace:

@@ -180,8 +180,8 @@ def test_time_that_jumps_back_and_contacts_that_come_and_go(benches):
 
 
 def test_states_stay_with_their_contacts_and_missing_values_are_no_motion(benches):
-    """Of two balls, the lighter one slides. One more begins, and the contacts change their order.
-    A cube beside the heavier ball is silent, and one component of another one is not known."""
+    """The lighter one of two balls slides. A third one begins, so that the contacts change their
+    order. A cube beside the heavier ball is silent, and one component of another is not known."""
     random = np.random.default_rng(3)
     body, skin, pads = Body(0.5, 10e-3, True), RubbedSkin(benches[0], random), []
     for number in range(60):
