@@ -37,6 +37,10 @@ PRIOR_LENGTHS = (0.2, 0.8)
 cubes' centres below the surface. They are close to the pair of lengths with the smallest errors for
 contacts of 2 to 20 mm in a half space at a depth of 5 mm."""
 
+AMPLITUDE = 20e3
+"""Prior standard deviation of the pressure on the surface, in Pa, before any value is measured. The
+value is the pressure of a firm touch."""
+
 SHEAR_RATIO = 0.5
 """Prior standard deviation of the shear traction along x and along y, divided by the prior standard
 deviation of the pressure."""

@@ -35,9 +35,8 @@ from scipy.linalg import block_diag, cho_solve, cholesky
 from ..core.arrays import Array, Index, Mask, Single
 from ..core.poses import CubePoses
 from ..mechanics.cache import load_or_compute
-from ..mechanics.traction_prior import TractionPrior
+from ..mechanics.traction_prior import AMPLITUDE, TractionPrior
 from .nearest_cubes import find_nearest_cubes
-from .prior import AMPLITUDE
 from .unrolled_skin import unroll
 
 WINDOW_CUBES = 25

@@ -19,11 +19,10 @@ from cube_tensor_driver.core.tensor import rotation_from_rpy
 from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.mechanics.layer import Layer
 from cube_tensor_driver.mechanics.measurement_model import CubeMeasurement
-from cube_tensor_driver.mechanics.traction_prior import TractionPrior
+from cube_tensor_driver.mechanics.traction_prior import AMPLITUDE, TractionPrior
 from cube_tensor_driver.touch.inverse import SurfaceInverse
 from cube_tensor_driver.touch.pad_noise import GAIN_ERROR
 from cube_tensor_driver.touch.posterior import MODEL_ERROR
-from cube_tensor_driver.touch.prior import AMPLITUDE
 from cube_tensor_driver.touch.surface import Surface
 
 DEPTH, PITCH, COUNT = 5e-3, 8e-3, 7

@@ -39,9 +39,8 @@ from scipy.linalg.lapack import dpstrf
 from scipy.spatial.distance import cdist
 
 from ...core.arrays import Array, Index, Mask, Single
-from ...mechanics.traction_prior import SHEAR_RATIO
+from ...mechanics.traction_prior import AMPLITUDE, SHEAR_RATIO
 from ..inverse import SurfaceInverse
-from ..prior import AMPLITUDE
 from ..surface import make_square_points
 from .contact_estimate import (
     N_MOMENTS,
